@@ -27,7 +27,7 @@ class SampleDatabase:
     speakers: tuple[str, ...]
     prompts: tuple[str, ...]
     paths: Mapping[str, Mapping[str, Path]]
-    marks: SurfaceMarks = SurfaceMarks()
+    marks: SurfaceMarks = field(default_factory=SurfaceMarks)
     provenance: str = ""
     source: str = ""
 
@@ -41,7 +41,7 @@ class TrainingShapes:
     speakers: tuple[str, ...]
     prompts: tuple[str, ...]
     filled: tuple[tuple[str, str], ...] = ()
-    marks: SurfaceMarks = SurfaceMarks()
+    marks: SurfaceMarks = field(default_factory=SurfaceMarks)
     provenance: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -57,7 +57,9 @@ def read_sample_database(path: str | Path) -> SampleDatabase:
         entries = content["data"]
         speaker_amount = int(content["meta"]["speakerAmount"])
         prompt_amount = int(content["meta"]["phonemeAmount"])
-        listed = [(str(e["name"]), [(str(p["prompt"]), p.get("path")) for p in e["phonemes"]]) for e in entries]
+        listed = [
+            (str(e["name"]), [(str(p["prompt"]), p.get("path")) for p in e["phonemes"]]) for e in entries
+        ]
     except (KeyError, TypeError, ValueError, AttributeError) as reason:
         raise InputError(
             f"{path}: this is not a sample database; expected meta {{speakerAmount, phonemeAmount}} and "
@@ -110,7 +112,9 @@ def load_training_shapes(database: SampleDatabase) -> TrainingShapes:
             try:
                 mesh = read_mesh(path)
             except InputError as reason:
-                raise InputError(f"{reason} (speaker '{speaker}', prompt '{prompt}' of {database.source})") from None
+                raise InputError(
+                    f"{reason} (speaker '{speaker}', prompt '{prompt}' of {database.source})"
+                ) from None
             if first is None:
                 first = (path, mesh)
             _check_same_faces(path, mesh, *first)
@@ -148,7 +152,9 @@ def fill_missing_by_averaging(tensor: FloatArray) -> tuple[FloatArray, list[tupl
     for speaker, pose in missing:
         if not present[speaker].any() or not present[:, pose].any():
             what = f"speaker {speaker}" if not present[speaker].any() else f"pose {pose}"
-            raise InputError(f"{what} (counted from 0) has no mesh at all, so nothing can be averaged for it.")
+            raise InputError(
+                f"{what} (counted from 0) has no mesh at all, so nothing can be averaged for it."
+            )
         own = tensor[speaker, present[speaker]].mean(axis=0)
         others = tensor[present[:, pose], pose].mean(axis=0)
         complete[speaker, pose] = 0.5 * (own + others)
@@ -162,7 +168,9 @@ def model_from_shapes(
     speakers, poses, _ = shapes.tensor.shape
     for wanted, most, name in ((speaker_modes, speakers, "speaker"), (pose_modes, poses, "pose")):
         if not 1 <= wanted <= most:
-            raise InputError(f"--{name}-modes {wanted}: expected a number from 1 to {most}, the training {name}s.")
+            raise InputError(
+                f"--{name}-modes {wanted}: expected a number from 1 to {most}, the training {name}s."
+            )
     origin = shapes.tensor.mean(axis=(0, 1))
     parts = hosvd(shapes.tensor - origin).truncated(speaker_modes, pose_modes)
     history = {
@@ -237,5 +245,7 @@ def _load_yaml(path: Path) -> Any:
         raise InputError(f"{path}: {path.stat().st_size} bytes are too many for a sample database.")
     content = load_yaml_text(path.read_bytes(), str(path))
     if not isinstance(content, dict):
-        raise InputError(f"{path}: this is not a sample database; expected a YAML map with 'meta' and 'data'.")
+        raise InputError(
+            f"{path}: this is not a sample database; expected a YAML map with 'meta' and 'data'."
+        )
     return content

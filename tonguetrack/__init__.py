@@ -31,7 +31,21 @@ _HOME_OF = {
     "track_recording": "tracker",
 }
 
-__all__ = ["InputError", "__version__", *_HOME_OF]
+__all__ = [
+    "CoilFrame",
+    "InputError",
+    "Recording",
+    "Session",
+    "SpeakerModel",
+    "TongueModel",
+    "TrackedPose",
+    "Tracker",
+    "__version__",
+    "load_model",
+    "open_recording",
+    "save_model",
+    "track_recording",
+]
 
 
 def __getattr__(name: str) -> Any:

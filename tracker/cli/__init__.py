@@ -1,0 +1,46 @@
+"""The command line. Each family of commands is one module; their handlers import the work they do."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from ... import InputError, __version__
+
+EXIT_BAD_INPUT = 2
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line as an argparse parser."""
+    from . import bench, demo, files, model, monitor, simulate, track
+
+    parser = argparse.ArgumentParser(
+        prog="tonguetrack",
+        description="Electromagnetic articulography coils in, the whole moving tongue out.",
+    )
+    parser.add_argument("--version", action="version", version=f"tonguetrack {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for family in (demo, track, files, model, simulate, monitor, bench):
+        family.add_commands(commands)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command. Bad input is one sentence on stderr and exit code 2."""
+    args = build_parser().parse_args(arguments)
+    try:
+        return int(args.run(args))
+    except InputError as reason:
+        print(f"tonguetrack: {reason}", file=sys.stderr)
+    except BrokenPipeError:
+        # Whoever read our output has enough (`tonguetrack info FILE | head`).
+        sys.stderr.close()
+        return 0
+    except OSError as reason:
+        place = f"{reason.filename}: " if reason.filename else ""
+        print(f"tonguetrack: {place}{reason.strerror or reason}.", file=sys.stderr)
+    except KeyboardInterrupt:
+        print("tonguetrack: stopped.", file=sys.stderr)
+        return 130
+    return EXIT_BAD_INPUT

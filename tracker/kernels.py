@@ -1,0 +1,659 @@
+"""The tracking energy and its exact minimisers, compiled. Numbers in, numbers out, nothing allocated.
+
+    E(s, p) = alpha/n sum_i |v_i(s, p) - q_i|^2
+              + beta_s |s - s_mean|^2 + beta_p |p - p_mean|^2
+              + gamma_s |s - s_previous|^2 + gamma_p |p - p_previous|^2
+    subject to low <= (s, p) <= high
+
+over the n coils that are present in the frame (paper, section "Using the model for tracking"; mm, raw
+weights). A coil is missing when its first coordinate is NaN.
+
+With the speaker fixed, E is a convex quadratic of the K coefficients: one box-constrained quadratic
+programme, solved exactly by an active set. With the speaker free, E is bilinear inside the square:
+Newton steps on the exact Hessian, each one such programme, Gauss-Newton or a shifted Hessian where the
+exact one is not positive definite; along any line E is a quartic, so a step is judged without
+evaluating the model again.
+
+Arrays are C-contiguous float64 with these names everywhere:
+    coils (n, 3) mm, NaN = missing
+    base (3n,), directions (K, 3n), gram (n, K, K): a fixed speaker's model at the coils' vertices
+    base (3n,), core (m, k, 3n): the multilinear model at the coils' vertices
+    box (3, K): rows mean, low, high
+    weights (K,): previous weights on entry, the minimiser on return
+    scratch: work space made once by `*_scratch`
+The functions are compiled lazily and cached; their argument types never change, so that nothing is
+compiled while frames arrive.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+# A step is the last one when it promises to lower the energy by less than this share of it. One more
+# Newton step from there gains its square, far below what float64 can show.
+RELATIVE_DECREASE = 1e-12
+MAX_NEWTON_STEPS = 100
+MAX_ACTIVE_SET_STEPS = 200
+
+STATUS_LOST, STATUS_OK, STATUS_HELD = 0, 1, 2
+
+
+def quadratic_scratch(size: int) -> np.ndarray:
+    """Work space of `minimise_quadratic_in_box`: (size + 4, size)."""
+    return np.zeros((size + 4, size))
+
+
+def fixed_scratch(size: int) -> np.ndarray:
+    """Work space of `solve_fixed_speaker`: Hessian, linear term, the quadratic programme's own, previous."""
+    return np.zeros((2 * size + 6, size))
+
+
+def free_scratch(speaker_size: int, pose_size: int, coils: int) -> tuple[np.ndarray, np.ndarray]:
+    """Work space of `solve_free_speaker`: one array in weights, one in coil coordinates."""
+    size = speaker_size + pose_size
+    return np.zeros((3 * size + 14, size)), np.zeros((size + 3, 3 * coils))
+
+
+@njit(cache=True, inline="never")
+def minimise_quadratic_in_box(hessian, linear, low, high, x, scratch):
+    """Minimises 1/2 x'Hx - linear'x over the box, from x, in place; True when H was positive definite
+    on every face of the box that was visited (only then is x the minimiser).
+
+    Primal active set: Newton step on the free coordinates up to the first bound in the way, which is
+    then held; at a face's minimum the held bound that pulls inwards most is let go.
+    """
+    size = x.shape[0]
+    factor = scratch[:size]
+    step = scratch[size]
+    gradient = scratch[size + 1]
+    held = scratch[size + 2]  # -1 at the lower bound, +1 at the upper, 0 free
+    index = scratch[size + 3]  # the free coordinates, as floats
+    for i in range(size):
+        if x[i] < low[i]:
+            x[i] = low[i]
+        elif x[i] > high[i]:
+            x[i] = high[i]
+        held[i] = 0.0
+    for _ in range(MAX_ACTIVE_SET_STEPS):
+        for i in range(size):
+            total = -linear[i]
+            for j in range(size):
+                total += hessian[i, j] * x[j]
+            gradient[i] = total
+        free = 0
+        for i in range(size):
+            if held[i] == 0.0:
+                index[free] = i
+                free += 1
+        if free > 0:
+            # Cholesky of the free block, then the Newton step on it.
+            for a in range(free):
+                i = int(index[a])
+                for b in range(a + 1):
+                    j = int(index[b])
+                    total = hessian[i, j]
+                    for c in range(b):
+                        total -= factor[a, c] * factor[b, c]
+                    if a == b:
+                        if total <= 1e-14 * abs(hessian[i, i]) or total <= 0.0:
+                            return False
+                        factor[a, a] = np.sqrt(total)
+                    else:
+                        factor[a, b] = total / factor[b, b]
+            for a in range(free):
+                total = -gradient[int(index[a])]
+                for c in range(a):
+                    total -= factor[a, c] * step[c]
+                step[a] = total / factor[a, a]
+            for a in range(free - 1, -1, -1):
+                total = step[a]
+                for c in range(a + 1, free):
+                    total -= factor[c, a] * step[c]
+                step[a] = total / factor[a, a]
+            # The largest share of the step that stays inside.
+            share = 1.0
+            blocking = -1
+            for a in range(free):
+                i = int(index[a])
+                if step[a] > 0.0:
+                    room = high[i] - x[i]
+                elif step[a] < 0.0:
+                    room = low[i] - x[i]
+                else:
+                    continue
+                if abs(step[a]) * share > abs(room):
+                    share = room / step[a]
+                    blocking = a
+            for a in range(free):
+                i = int(index[a])
+                x[i] += share * step[a]
+                if x[i] < low[i]:
+                    x[i] = low[i]
+                elif x[i] > high[i]:
+                    x[i] = high[i]
+            if blocking >= 0:
+                i = int(index[blocking])
+                if step[blocking] > 0.0:
+                    x[i] = high[i]
+                    held[i] = 1.0
+                else:
+                    x[i] = low[i]
+                    held[i] = -1.0
+                continue
+            for i in range(size):
+                if held[i] != 0.0:
+                    total = -linear[i]
+                    for j in range(size):
+                        total += hessian[i, j] * x[j]
+                    gradient[i] = total
+        worst = 0.0
+        release = -1
+        for i in range(size):
+            if held[i] != 0.0 and low[i] < high[i]:
+                # At the upper bound the gradient must be <= 0, at the lower >= 0.
+                pull = held[i] * gradient[i]
+                if pull > worst + 1e-13 * (abs(linear[i]) + 1e-300):
+                    worst = pull
+                    release = i
+        if release < 0:
+            return True
+        held[release] = 0.0
+    return True
+
+
+@njit(cache=True, inline="never")
+def coil_residuals(coils, base, directions, weights, residuals):
+    """residuals (n,): distance in mm of each coil from its vertex, NaN where the coil is missing.
+    Returns their mean over the present coils (NaN without any)."""
+    size = weights.shape[0]
+    total = 0.0
+    present = 0
+    for i in range(coils.shape[0]):
+        if np.isnan(coils[i, 0]):
+            residuals[i] = np.nan
+            continue
+        squared = 0.0
+        for axis in range(3):
+            row = 3 * i + axis
+            value = base[row] - coils[i, axis]
+            for k in range(size):
+                value += directions[k, row] * weights[k]
+            squared += value * value
+        residuals[i] = np.sqrt(squared)
+        total += residuals[i]
+        present += 1
+    return total / present if present > 0 else np.nan
+
+
+@njit(cache=True, inline="never")
+def coil_grams(directions, gram):
+    """gram (n, K, K): the products of the directions at each coil, constant for a fixed speaker."""
+    size = directions.shape[0]
+    for i in range(gram.shape[0]):
+        for a in range(size):
+            for b in range(size):
+                total = 0.0
+                for row in range(3 * i, 3 * i + 3):
+                    total += directions[a, row] * directions[b, row]
+                gram[i, a, b] = total
+
+
+@njit(cache=True, inline="never")
+def solve_fixed_speaker(
+    coils, base, directions, gram, box, energy, coherent, weights, residuals, scratch, result
+):
+    """One frame with the speaker fixed. energy: (alpha, beta, gamma); coherent: False drops gamma.
+
+    result (2,): energy, mean residual in mm. Returns the status; with no coil present the weights stay.
+    """
+    size = weights.shape[0]
+    alpha = energy[0]
+    beta = energy[1]
+    gamma = energy[2] if coherent else 0.0
+    hessian = scratch[:size]
+    linear = scratch[size]
+    present = 0
+    for i in range(coils.shape[0]):
+        if not np.isnan(coils[i, 0]):
+            present += 1
+    if present == 0:
+        result[0] = np.nan
+        result[1] = coil_residuals(coils, base, directions, weights, residuals)
+        return STATUS_HELD
+    share = 2.0 * alpha / present
+    for a in range(size):
+        for b in range(size):
+            hessian[a, b] = 0.0
+        hessian[a, a] = 2.0 * (beta + gamma)
+        linear[a] = 2.0 * (beta * box[0, a] + gamma * weights[a])
+    for i in range(coils.shape[0]):
+        if np.isnan(coils[i, 0]):
+            continue
+        for a in range(size):
+            for b in range(size):
+                hessian[a, b] += share * gram[i, a, b]
+            total = 0.0
+            for axis in range(3):
+                row = 3 * i + axis
+                total += directions[a, row] * (coils[i, axis] - base[row])
+            linear[a] += share * total
+    previous = scratch[2 * size + 5]
+    for a in range(size):
+        previous[a] = weights[a]
+    ridge = 0.0
+    while not minimise_quadratic_in_box(
+        hessian, linear, box[1], box[2], weights, scratch[size + 1 : 2 * size + 5]
+    ):
+        # Without bias and coherence too few coils leave directions undetermined: the smallest ridge
+        # that float64 can factorise picks the solution next to the previous weights.
+        trace = 0.0
+        for a in range(size):
+            trace += abs(hessian[a, a])
+        added = max(1e-10 * trace, 1e-12) if ridge == 0.0 else 9.0 * ridge
+        ridge += added
+        for a in range(size):
+            hessian[a, a] += added
+            linear[a] += added * previous[a]
+            weights[a] = previous[a]
+    mean_residual = coil_residuals(coils, base, directions, weights, residuals)
+    total = 0.0
+    for i in range(coils.shape[0]):
+        if not np.isnan(residuals[i]):
+            total += residuals[i] * residuals[i]
+    total *= alpha / present
+    for a in range(size):
+        off_mean = weights[a] - box[0, a]
+        off_previous = weights[a] - previous[a]
+        total += beta * off_mean * off_mean + gamma * off_previous * off_previous
+    result[0] = total
+    result[1] = mean_residual
+    return STATUS_OK
+
+
+@njit(cache=True, inline="never")
+def _jacobian_and_residual(coils, base, core, weights, jacobian, residual):
+    """jacobian (m + n, 3n): d v / d weight; residual (3n,): v - q. Rows of missing coils are zero."""
+    speakers, poses, rows = core.shape
+    for a in range(speakers + poses):
+        for row in range(rows):
+            jacobian[a, row] = 0.0
+    for l in range(speakers):
+        speaker_weight = weights[l]
+        for k in range(poses):
+            pose_weight = weights[speakers + k]
+            for row in range(rows):
+                value = core[l, k, row]
+                jacobian[l, row] += pose_weight * value
+                jacobian[speakers + k, row] += speaker_weight * value
+    for row in range(rows):
+        residual[row] = base[row] - coils[row // 3, row % 3]
+    for l in range(speakers):
+        for row in range(rows):
+            residual[row] += weights[l] * jacobian[l, row]
+    for i in range(coils.shape[0]):
+        if np.isnan(coils[i, 0]):
+            for row in range(3 * i, 3 * i + 3):
+                residual[row] = 0.0
+                for a in range(speakers + poses):
+                    jacobian[a, row] = 0.0
+
+
+@njit(cache=True, inline="never")
+def free_energy(coils, base, core, box, alpha, beta, gamma, previous, weights, jacobian, residual):
+    """E at `weights`; leaves the Jacobian and the residual of that point behind. beta, gamma: (m + n,)."""
+    _jacobian_and_residual(coils, base, core, weights, jacobian, residual)
+    present = 0
+    for i in range(coils.shape[0]):
+        if not np.isnan(coils[i, 0]):
+            present += 1
+    total = 0.0
+    for row in range(residual.shape[0]):
+        total += residual[row] * residual[row]
+    total *= alpha / present
+    for a in range(weights.shape[0]):
+        off_mean = weights[a] - box[0, a]
+        off_previous = weights[a] - previous[a]
+        total += beta[a] * off_mean * off_mean + gamma[a] * off_previous * off_previous
+    return total
+
+
+@njit(cache=True, inline="never")
+def free_gradient_and_hessian(
+    coils, core, box, alpha, beta, gamma, previous, weights, jacobian, residual, exact, gradient, hessian
+):
+    """Derivatives of `free_energy` from the Jacobian and residual it left. exact: with the bilinear term
+    of the Hessian; else Gauss-Newton's, which is never indefinite."""
+    speakers, poses, rows = core.shape
+    present = 0
+    for i in range(coils.shape[0]):
+        if not np.isnan(coils[i, 0]):
+            present += 1
+    share = 2.0 * alpha / present
+    for a in range(weights.shape[0]):
+        total = 0.0
+        for row in range(rows):
+            total += jacobian[a, row] * residual[row]
+        gradient[a] = share * total + 2.0 * (
+            beta[a] * (weights[a] - box[0, a]) + gamma[a] * (weights[a] - previous[a])
+        )
+        for b in range(a + 1):
+            total = 0.0
+            for row in range(rows):
+                total += jacobian[a, row] * jacobian[b, row]
+            hessian[a, b] = share * total
+    if exact:
+        for l in range(speakers):
+            for k in range(poses):
+                total = 0.0
+                for row in range(rows):
+                    total += residual[row] * core[l, k, row]
+                hessian[speakers + k, l] += share * total
+    for a in range(weights.shape[0]):
+        hessian[a, a] += 2.0 * (beta[a] + gamma[a])
+        for b in range(a):
+            hessian[b, a] = hessian[a, b]
+
+
+@njit(cache=True, inline="never")
+def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scratch, coil_scratch):
+    """Minimises E over the box from `weights`, in place. Returns E at the minimiser."""
+    size = weights.shape[0]
+    rows = core.shape[2]
+    speakers = core.shape[0]
+    hessian = scratch[:size]
+    shifted = scratch[size : 2 * size]
+    gradient = scratch[2 * size]
+    linear = scratch[2 * size + 1]
+    target = scratch[2 * size + 2]
+    quadratic = scratch[2 * size + 3 : 3 * size + 7]
+    jacobian = coil_scratch[:size]
+    residual = coil_scratch[size]
+    first_order = coil_scratch[size + 1]
+    second_order = coil_scratch[size + 2]
+    for a in range(size):
+        weights[a] = min(max(weights[a], box[1, a]), box[2, a])
+    present = 0
+    for i in range(coils.shape[0]):
+        if not np.isnan(coils[i, 0]):
+            present += 1
+    share = alpha / present
+    use_gauss_newton = True  # as the first resort when the exact Hessian is not positive definite
+    for _ in range(MAX_NEWTON_STEPS):
+        energy = free_energy(
+            coils, base, core, box, alpha, beta, gamma, previous, weights, jacobian, residual
+        )
+        shift = 0.0
+        exact = True
+        while True:
+            if shift == 0.0:
+                free_gradient_and_hessian(
+                    coils,
+                    core,
+                    box,
+                    alpha,
+                    beta,
+                    gamma,
+                    previous,
+                    weights,
+                    jacobian,
+                    residual,
+                    exact,
+                    gradient,
+                    hessian,
+                )
+            for a in range(size):
+                total = -gradient[a]
+                for b in range(size):
+                    shifted[a, b] = hessian[a, b]
+                shifted[a, a] += shift
+                for b in range(size):
+                    total += shifted[a, b] * weights[b]
+                linear[a] = total
+                target[a] = weights[a]
+            convex = minimise_quadratic_in_box(shifted, linear, box[1], box[2], target, quadratic)
+            slope = 0.0
+            curvature = 0.0
+            for a in range(size):
+                slope += gradient[a] * (target[a] - weights[a])
+                for b in range(size):
+                    curvature += (target[a] - weights[a]) * shifted[a, b] * (target[b] - weights[b])
+            if convex and slope <= 0.0:
+                break
+            if exact and use_gauss_newton and shift == 0.0:
+                exact = False
+                continue
+            exact = True if shift == 0.0 and not exact else exact
+            if shift == 0.0:
+                free_gradient_and_hessian(
+                    coils,
+                    core,
+                    box,
+                    alpha,
+                    beta,
+                    gamma,
+                    previous,
+                    weights,
+                    jacobian,
+                    residual,
+                    True,
+                    gradient,
+                    hessian,
+                )
+                trace = 0.0
+                for a in range(size):
+                    trace += abs(hessian[a, a])
+                shift = 1e-3 * trace / size + 1e-12
+            else:
+                shift *= 8.0
+            if shift > 1e30:
+                return energy
+        promised = -(slope + 0.5 * curvature)
+        # E(t) along the step: the residual is residual + t first + t^2 second, exactly.
+        for row in range(rows):
+            first_order[row] = 0.0
+            second_order[row] = 0.0
+        for a in range(size):
+            delta = target[a] - weights[a]
+            for row in range(rows):
+                first_order[row] += delta * jacobian[a, row]
+        for l in range(speakers):
+            for k in range(size - speakers):
+                delta = (target[l] - weights[l]) * (target[speakers + k] - weights[speakers + k])
+                for row in range(rows):
+                    second_order[row] += delta * core[l, k, row]
+        for i in range(coils.shape[0]):
+            if np.isnan(coils[i, 0]):
+                for row in range(3 * i, 3 * i + 3):
+                    second_order[row] = 0.0
+        rr = 0.0
+        ra = 0.0
+        aa_rb = 0.0
+        ab = 0.0
+        bb = 0.0
+        for row in range(rows):
+            r = residual[row]
+            a1 = first_order[row]
+            b1 = second_order[row]
+            rr += r * r
+            ra += 2.0 * r * a1
+            aa_rb += a1 * a1 + 2.0 * r * b1
+            ab += 2.0 * a1 * b1
+            bb += b1 * b1
+        prior_second = 0.0
+        for a in range(size):
+            delta = target[a] - weights[a]
+            prior_second += (beta[a] + gamma[a]) * delta * delta
+        third = share * ab
+        fourth = share * bb
+        second = share * aa_rb + prior_second
+        length = 1.0
+        change = slope + second + third + fourth
+        while change > 1e-4 * length * slope and length > 1e-12:
+            length *= 0.5
+            change = length * (slope + length * (second + length * (third + length * fourth)))
+        if change > 0.0:
+            return energy
+        for a in range(size):
+            weights[a] += length * (target[a] - weights[a])
+        if promised <= RELATIVE_DECREASE * energy + 1e-24:
+            return energy + change
+        if not exact and -change < 0.25 * promised:
+            use_gauss_newton = False
+    return energy
+
+
+@njit(cache=True, inline="never")
+def solve_free_speaker(
+    coils, base, core, box, energy, coherent, restart, weights, residuals, scratch, coil_scratch, result
+):
+    """One frame with speaker and pose free; weights (m + n,) = speaker weights, then pose weights.
+
+    energy: (alpha, beta_s, beta_p, gamma_s, gamma_p); coherent: False drops gamma.
+    restart: also descend from the other sign flips of the starting weights and keep the best, because
+    v(s, p) = v(-s, -p) puts mirror minima inside a wide box. A flip that ends elsewhere must be lower
+    by more than rounding to be taken. result (2,): energy, mean residual in mm. Returns the status.
+    """
+    size = weights.shape[0]
+    speakers = core.shape[0]
+    present = 0
+    for i in range(coils.shape[0]):
+        if not np.isnan(coils[i, 0]):
+            present += 1
+    beta = scratch[3 * size + 7]
+    gamma = scratch[3 * size + 8]
+    previous = scratch[3 * size + 9]
+    start = scratch[3 * size + 10]
+    candidate = scratch[3 * size + 11]
+    for a in range(size):
+        beta[a] = energy[1] if a < speakers else energy[2]
+        gamma[a] = (energy[3] if a < speakers else energy[4]) if coherent else 0.0
+        previous[a] = weights[a]
+        start[a] = weights[a]
+    if present > 0:
+        best = _descend(
+            coils, base, core, box, energy[0], beta, gamma, previous, weights, scratch, coil_scratch
+        )
+        if restart:
+            for flip in range(1, 4):
+                for a in range(size):
+                    negate = flip & 1 if a < speakers else flip & 2
+                    candidate[a] = -start[a] if negate else start[a]
+                value = _descend(
+                    coils, base, core, box, energy[0], beta, gamma, previous, candidate, scratch, coil_scratch
+                )
+                if value < best * (1.0 - 1e-9):
+                    best = value
+                    for a in range(size):
+                        weights[a] = candidate[a]
+        result[0] = best
+    else:
+        result[0] = np.nan
+    directions = coil_scratch[:size]
+    residual = coil_scratch[size]
+    _jacobian_and_residual(coils, base, core, weights, directions, residual)
+    total = 0.0
+    for i in range(coils.shape[0]):
+        if np.isnan(coils[i, 0]):
+            residuals[i] = np.nan
+            continue
+        squared = 0.0
+        for row in range(3 * i, 3 * i + 3):
+            squared += residual[row] * residual[row]
+        residuals[i] = np.sqrt(squared)
+        total += residuals[i]
+    result[1] = total / present if present > 0 else np.nan
+    return STATUS_OK if present > 0 else STATUS_HELD
+
+
+@njit(cache=True, inline="never")
+def prepare_frame(raw, picked, rotation, translation, project, coils):
+    """coils (n, 3) in the model frame from a source's raw (all coils, 3).
+
+    picked (n,): indices into raw; rotation (3, 3), translation (3,) mm: model = rotation raw +
+    translation; project: set the lateral coordinate to the mid-sagittal plane's 0. A coil with any
+    coordinate that is not a finite number becomes all NaN.
+    """
+    for i in range(picked.shape[0]):
+        x = raw[picked[i], 0]
+        y = raw[picked[i], 1]
+        z = raw[picked[i], 2]
+        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
+            for axis in range(3):
+                coils[i, axis] = np.nan
+            continue
+        for axis in range(3):
+            coils[i, axis] = (
+                rotation[axis, 0] * x + rotation[axis, 1] * y + rotation[axis, 2] * z + translation[axis]
+            )
+        if project:
+            coils[i, 0] = 0.0
+
+
+@njit(cache=True)
+def prepare_frames(raw, picked, rotation, translation, project, coils):
+    """`prepare_frame` for raw (frames, all coils, 3) into coils (frames, n, 3)."""
+    for frame in range(raw.shape[0]):
+        prepare_frame(raw[frame], picked, rotation, translation, project, coils[frame])
+
+
+@njit(cache=True)
+def track_fixed_speaker(
+    coils,
+    base,
+    directions,
+    gram,
+    box,
+    energy,
+    coherent,
+    weights,
+    residuals,
+    scratch,
+    results,
+    tracked,
+    statuses,
+):
+    """`solve_fixed_speaker` over coils (frames, n, 3), each frame from the one before.
+
+    coherent: whether the first frame already has a previous one. tracked (frames, K), residuals
+    (frames, n), results (frames, 2), statuses (frames,) are filled.
+    """
+    for frame in range(coils.shape[0]):
+        status = solve_fixed_speaker(
+            coils[frame], base, directions, gram, box, energy, coherent, weights, residuals[frame], scratch,
+            results[frame],
+        )  # fmt: skip
+        coherent = coherent or status == STATUS_OK
+        statuses[frame] = status
+        for a in range(weights.shape[0]):
+            tracked[frame, a] = weights[a]
+
+
+@njit(cache=True)
+def track_free_speaker(
+    coils,
+    base,
+    core,
+    box,
+    energy,
+    coherent,
+    weights,
+    residuals,
+    scratch,
+    coil_scratch,
+    results,
+    tracked,
+    statuses,
+):
+    """`solve_free_speaker` over coils (frames, n, 3); restarts where nothing was tracked before."""
+    restart = not coherent
+    for frame in range(coils.shape[0]):
+        status = solve_free_speaker(
+            coils[frame], base, core, box, energy, coherent, restart, weights, residuals[frame], scratch,
+            coil_scratch, results[frame],
+        )  # fmt: skip
+        coherent = coherent or status == STATUS_OK
+        restart = status != STATUS_OK
+        statuses[frame] = status
+        for a in range(weights.shape[0]):
+            tracked[frame, a] = weights[a]

@@ -1,0 +1,90 @@
+"""What leaves the tracker. Streams, files and viewers know this and nothing else of the tracker.
+
+A mesh is base + K directions x K coefficients, whatever estimator made them: a `SpeakerModel` carries
+the first two, a `TrackedPose` the coefficients of one instant, `TrackedPoses` those of a whole take.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+class PoseStatus(IntEnum):
+    """How far a pose can be trusted; the same numbers as on the wire."""
+
+    LOST = 0  # nothing was ever tracked, or the source is gone: the pose is the mean
+    OK = 1
+    HELD = 2  # no coil arrived in this frame: the pose is the previous one
+    RELAXING = 3  # no coil for longer: the pose drifts back to the mean (reserved for live sources)
+
+
+@dataclass(slots=True)
+class TrackedPose:
+    """One frame's pose. The tracker owns one and writes over it; sinks copy what they keep.
+
+    weights, normalised: (K,) raw, and in sigma from the mean.
+    speaker_weights: (m,) raw; constant while the speaker is fixed.
+    residuals_mm: (n,) distance of each coil from its vertex, NaN = missing.
+    residual_mm: their mean, NaN without any coil; energy: E at the minimiser, NaN likewise.
+    device_time_s, frame_number: of the source; arrival_ns, solved_ns: `time.perf_counter_ns()` on this host.
+    """
+
+    weights: FloatArray
+    normalised: FloatArray
+    speaker_weights: FloatArray
+    residuals_mm: FloatArray
+    residual_mm: float = float("nan")
+    energy: float = float("nan")
+    valid_coils: int = 0
+    status: int = PoseStatus.LOST
+    device_time_s: float = 0.0
+    frame_number: int = 0
+    arrival_ns: int = 0
+    solved_ns: int = 0
+
+
+@dataclass(frozen=True)
+class TrackedPoses:
+    """A whole take's poses in arrays.
+
+    times_s, statuses, energies, residual_mm: (frames,); weights, normalised: (frames, K);
+    speaker_weights: (frames, m), equal rows while the speaker is fixed;
+    residuals_mm: (frames, n), NaN = missing; coils, vertices: (frames, n, 3) mm in the model frame:
+    the prepared coil positions and the model's points that they were fitted to.
+    roles: the coils' roles in the order of the n axis; correspondences: their vertices, in that order.
+    experiment: 1 (speaker and pose free) or 2 (speaker fixed).
+    """
+
+    times_s: FloatArray
+    statuses: NDArray[np.int64]
+    weights: FloatArray
+    normalised: FloatArray
+    speaker_weights: FloatArray
+    energies: FloatArray
+    residual_mm: FloatArray
+    residuals_mm: FloatArray
+    coils: FloatArray
+    vertices: FloatArray
+    roles: tuple[str, ...]
+    correspondences: tuple[int, ...]
+    experiment: int
+    rate_hz: float
+    model_path: str = ""
+    model_fingerprint: str = ""
+    model_name: str = ""
+    recording: str = ""
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.times_s)
+
+    @property
+    def tracked(self) -> NDArray[np.bool_]:
+        """(frames,): True where at least one coil was there."""
+        return np.asarray(self.statuses == PoseStatus.OK)

@@ -1,0 +1,51 @@
+"""Raw coil positions in the source's frame -> the tracked coils in the model frame.
+
+The flow: pick the coils, (head correction, bite plane, palate: their place is here, between picking and
+aligning; not built yet), align rigidly, project into the mid-sagittal plane. The same compiled function
+serves one live frame and a whole recording, so both give the same bits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import kernels
+from .pose import FloatArray
+from .session import Alignment
+
+
+class Preparation:
+    """picked: (n,) int64 indices of the tracked coils among the source's."""
+
+    def __init__(self, picked: NDArray[np.int64], alignment: Alignment) -> None:
+        self._picked = np.ascontiguousarray(picked, dtype=np.int64)
+        self._rotation = np.array(alignment.rotation, dtype=np.float64, order="C")
+        self._translation = np.array(alignment.translation_mm, dtype=np.float64)
+        self._midsagittal = alignment.midsagittal
+        self.coils: FloatArray = np.full((len(self._picked), 3), np.nan)
+
+    @property
+    def channels_needed(self) -> int:
+        """The least number of channels that a raw frame must have."""
+        return int(self._picked.max()) + 1
+
+    def frame(self, raw: FloatArray) -> FloatArray:
+        """Fills and returns `self.coils` (n, 3) from raw (all coils, 3); NaN = missing in both."""
+        kernels.prepare_frame(
+            raw, self._picked, self._rotation, self._translation, self._midsagittal, self.coils
+        )
+        return self.coils
+
+    def all_frames(self, raw: FloatArray) -> FloatArray:
+        """(frames, n, 3) from raw (frames, all coils, 3)."""
+        prepared = np.empty((len(raw), len(self._picked), 3))
+        kernels.prepare_frames(
+            np.ascontiguousarray(raw, dtype=np.float64),
+            self._picked,
+            self._rotation,
+            self._translation,
+            self._midsagittal,
+            prepared,
+        )
+        return prepared

@@ -1,0 +1,272 @@
+"""The session: everything known about one speaker's set-up, in a TOML file that a person can edit.
+
+    model = "fa9b8dece7ea1236"        # fingerprint of the model that the vertices below belong to
+
+    [coils]                           # file channel = role
+    t_tip = "tongue_tip"
+
+    [alignment]                       # model = rotation source + translation, then the projection
+    axes = ["-y", "-x", "z"]          # or rotation = [[...], [...], [...]]
+    translation_mm = [0.0, 0.0, 0.0]
+    midsagittal = true
+
+    [correspondences]                 # role = vertex
+    tongue_tip = 2469
+
+    [speaker]
+    weights = [...]
+    source = "mean of experiment 1 over sweep 12"
+
+    [energy]
+    alpha = 1.0
+
+Whatever is absent is estimated or has its default, and the tracker says which. Head correction, bite
+plane and palate belong between [coils] and [alignment]; their tables are not read yet.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import InputError
+from .coilmap import checked_coil_map
+from .pose import FloatArray
+
+MAX_SESSION_BYTES = 1024 * 1024
+NO_SESSION = "no session file"
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Rigid motion from the source's frame to the model frame: model = rotation @ source + translation.
+
+    rotation: (3, 3), orthonormal, right-handed unless the source itself is left-handed (axis mappings
+    may mirror; a matrix may not); translation_mm: (3,). midsagittal: afterwards the lateral coordinate
+    is set to 0, as the paper does with mid-sagittal coils.
+    """
+
+    rotation: FloatArray = field(default_factory=lambda: np.eye(3))
+    translation_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
+    midsagittal: bool = False
+
+    @property
+    def is_identity(self) -> bool:
+        return bool(
+            np.array_equal(self.rotation, np.eye(3))
+            and not self.translation_mm.any()
+            and not self.midsagittal
+        )
+
+    def __str__(self) -> str:
+        if self.is_identity:
+            return "none: the recording is taken to be in the model's frame"
+        moved = not (np.array_equal(self.rotation, np.eye(3)) and not self.translation_mm.any())
+        parts = [] if not moved else [f"rigid, translation {np.round(self.translation_mm, 2).tolist()} mm"]
+        return " and ".join(parts + (["projection into the mid-sagittal plane"] if self.midsagittal else []))
+
+
+@dataclass(frozen=True)
+class Energy:
+    """The weights of the tracking energy (paper: alpha 1, beta = gamma = 5, box 5).
+
+    alpha: data; beta_*: bias towards the mean weights; gamma_*: coherence with the previous frame,
+    separately for speaker and pose; box: h, the widest allowed deviation in sigma.
+    """
+
+    alpha: float = 1.0
+    beta_speaker: float = 5.0
+    beta_pose: float = 5.0
+    gamma_speaker: float = 5.0
+    gamma_pose: float = 5.0
+    box: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if not np.isfinite(value) or value < 0 or (name in ("alpha", "box") and value == 0):
+                least = "above 0" if name in ("alpha", "box") else "0 or more"
+                raise InputError(f"[energy] {name} = {value}: expected a finite number, {least}.")
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a session file states; None or empty = not stated.
+
+    coils: channel -> role; correspondences: role -> vertex; speaker_weights: (m,) raw.
+    """
+
+    coils: Mapping[str, str] = field(default_factory=dict)
+    alignment: Alignment = field(default_factory=Alignment)
+    correspondences: Mapping[str, int] = field(default_factory=dict)
+    speaker_weights: FloatArray | None = None
+    speaker_source: str = ""
+    energy: Energy = Energy()
+    model_fingerprint: str = ""
+    source: str = NO_SESSION
+
+
+def load_session(path: str | Path) -> Session:
+    """Reads a session file. Raises InputError that names the table and key at fault."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such session file.")
+    if path.stat().st_size > MAX_SESSION_BYTES:
+        raise InputError(f"{path}: {path.stat().st_size} bytes are too many for a session file.")
+    try:
+        content = tomllib.loads(path.read_bytes().decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as reason:
+        raise InputError(f"{path}: this is not readable TOML ({reason}).") from reason
+    try:
+        return _session_from(content, str(path))
+    except InputError as reason:
+        raise InputError(f"{path}: {reason}") from reason
+
+
+def session_toml(session: Session) -> str:
+    """The session as the text of a file; `load_session` gives it back unchanged."""
+    import tomlkit
+
+    document = tomlkit.document()
+    if session.model_fingerprint:
+        document.add("model", tomlkit.item(session.model_fingerprint))
+        document["model"].comment("the model that the vertices below belong to")
+    _add_table(document, "coils", "file channel = role", dict(session.coils))
+    alignment = session.alignment
+    _add_table(
+        document,
+        "alignment",
+        "model = rotation source + translation, then the projection",
+        {
+            "rotation": alignment.rotation.tolist(),
+            "translation_mm": alignment.translation_mm.tolist(),
+            "midsagittal": alignment.midsagittal,
+        },
+    )
+    _add_table(document, "correspondences", "role = vertex", dict(session.correspondences))
+    if session.speaker_weights is not None:
+        speaker = {"weights": session.speaker_weights.tolist(), "source": session.speaker_source}
+        _add_table(document, "speaker", "raw weights of the anatomy", speaker)
+    energy = {name: getattr(session.energy, name) for name in Energy.__dataclass_fields__}
+    _add_table(document, "energy", "weights of the terms; box in sigma", energy)
+    return tomlkit.dumps(document)
+
+
+def _add_table(document: Any, name: str, comment: str, content: Mapping[str, Any]) -> None:
+    import tomlkit
+
+    table = tomlkit.table()
+    table.comment(comment)
+    for key, value in content.items():
+        table.add(key, value)
+    document.add(name, table)
+
+
+def _session_from(content: Mapping[str, Any], source: str) -> Session:
+    known = {"model", "coils", "alignment", "correspondences", "speaker", "energy"}
+    for table in content:
+        if table not in known:
+            raise InputError(f"the table or key '{table}' is unknown; expected {', '.join(sorted(known))}.")
+    coils = {str(k): _text(v, f"[coils] {k}") for k, v in _table(content, "coils").items()}
+    if coils:
+        checked_coil_map(coils, "[coils]")
+    correspondences = {
+        str(k): _integer(v, f"[correspondences] {k}") for k, v in _table(content, "correspondences").items()
+    }
+    speaker = _table(content, "speaker")
+    _only(speaker, {"weights", "source"}, "speaker")
+    weights = _numbers(speaker["weights"], None, "[speaker] weights") if "weights" in speaker else None
+    energy = _table(content, "energy")
+    _only(energy, set(Energy.__dataclass_fields__), "energy")
+    return Session(
+        coils,
+        _alignment(_table(content, "alignment")),
+        correspondences,
+        weights,
+        str(speaker.get("source", "")),
+        Energy(**{name: _number(value, f"[energy] {name}") for name, value in energy.items()}),
+        _text(content.get("model", ""), "model"),
+        source,
+    )
+
+
+def _alignment(table: Mapping[str, Any]) -> Alignment:
+    _only(table, {"axes", "rotation", "translation_mm", "midsagittal"}, "alignment")
+    if "axes" in table and "rotation" in table:
+        raise InputError("[alignment] has both 'axes' and 'rotation'; keep one of them.")
+    rotation = np.eye(3)
+    if "axes" in table:
+        rotation = axis_mapping(table["axes"])
+    elif "rotation" in table:
+        rotation = _numbers(table["rotation"], (3, 3), "[alignment] rotation")
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+            raise InputError(
+                "[alignment] rotation is not orthonormal; scale and shear are not part of an alignment."
+            )
+    translation = _numbers(table.get("translation_mm", [0.0, 0.0, 0.0]), (3,), "[alignment] translation_mm")
+    midsagittal = table.get("midsagittal", False)
+    if not isinstance(midsagittal, bool):
+        raise InputError(f"[alignment] midsagittal = {midsagittal!r}: expected true or false.")
+    return Alignment(rotation, translation, midsagittal)
+
+
+def axis_mapping(axes: Any) -> FloatArray:
+    """(3, 3) from three signed axis names: ["-y", "x", "z"] makes the model's x the source's -y."""
+    names = [str(axis).strip().lower() for axis in axes] if isinstance(axes, (list, tuple)) else []
+    plain = [name.lstrip("+-") for name in names]
+    if sorted(plain) != ["x", "y", "z"] or any(len(name) - len(bare) > 1 for name, bare in zip(names, plain)):
+        raise InputError(
+            f"[alignment] axes = {axes!r}: expected three of x, y, z, each once, with a sign where the axis "
+            'is turned round, as in ["y", "-x", "z"].'
+        )
+    matrix = np.zeros((3, 3))
+    for row, (name, bare) in enumerate(zip(names, plain)):
+        matrix[row, "xyz".index(bare)] = -1.0 if name.startswith("-") else 1.0
+    return matrix
+
+
+def _table(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    table = content.get(name, {})
+    if not isinstance(table, dict):
+        raise InputError(f"'{name}' should be a table, [{name}].")
+    return table
+
+
+def _only(table: Mapping[str, Any], known: set[str], name: str) -> None:
+    for key in table:
+        if key not in known:
+            raise InputError(f"[{name}] has the unknown key '{key}'; expected {', '.join(sorted(known))}.")
+
+
+def _text(value: Any, where: str) -> str:
+    if not isinstance(value, str):
+        raise InputError(f"{where} = {value!r}: expected text in quotes.")
+    return value
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(f"{where} = {value!r}: expected a number.")
+    return float(value)
+
+
+def _integer(value: Any, where: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise InputError(f"{where} = {value!r}: expected a whole number, the index of a vertex.")
+    return value
+
+
+def _numbers(values: Any, shape: tuple[int, ...] | None, where: str) -> FloatArray:
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (ValueError, TypeError) as reason:
+        raise InputError(f"{where}: expected numbers only.") from reason
+    if not np.isfinite(array).all() or (shape is not None and array.shape != shape) or array.ndim == 0:
+        wanted = f" in the shape {shape}" if shape else ""
+        raise InputError(f"{where}: expected finite numbers{wanted}.")
+    return array

@@ -1,0 +1,173 @@
+"""From what a session states and a recording shows to everything the tracker needs, with the reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import InputError
+from ..drivers.frames import FrameOfReference, Recording
+from ..model.multilinear import TongueModel
+from .coilmap import CoilMap, checked_coil_map, guess_coil_map
+from .correspondences import estimate_correspondences
+from .preparation import Preparation
+from .session import NO_SESSION, Session, axis_mapping
+
+MODEL_FRAME = FrameOfReference("left", "back", "up", "model")
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A complete set-up. channels, roles, vertices: in the order in which the coils are tracked.
+
+    session: the session with everything that was estimated written into it (what a file would hold).
+    decisions: one sentence for each thing that was estimated, defaulted or noticed.
+    """
+
+    channels: tuple[str, ...]
+    roles: tuple[str, ...]
+    vertices: tuple[int, ...]
+    preparation: Preparation
+    session: Session
+    decisions: tuple[str, ...]
+
+
+def complete_setup(recording: Recording, model: TongueModel, session: Session) -> Setup:
+    """Checks the session against recording and model, and estimates what it leaves open.
+
+    Raises InputError where they contradict each other: a coil that is not in the recording, a vertex
+    that is not in the model, speaker weights of another model.
+    """
+    decisions = []
+    coil_map = _coil_map(recording, session)
+    if not session.coils:
+        named = ", ".join(f"{channel} = {role}" for channel, role in coil_map.roles.items())
+        decisions.append(f"coils ({coil_map.why}): {named}")
+    channels, roles = tuple(coil_map.tongue), tuple(coil_map.tongue.values())
+    preparation = Preparation(picked_channels(recording.coils, channels), session.alignment)
+    decisions.append(
+        f"alignment ({'default' if session.source == NO_SESSION else 'session'}): {session.alignment}"
+    )
+    decisions.extend(_frame_hints(recording, session))
+    _check_speaker(model, session)
+
+    stated = {role: session.correspondences[role] for role in roles if role in session.correspondences}
+    for role in session.correspondences:
+        if role not in roles:
+            raise InputError(
+                f"{session.source}: [correspondences] names the role '{role}', but the tracked coils are "
+                f"{', '.join(roles)}."
+            )
+    if len(stated) == len(roles):
+        vertices = tuple(stated[role] for role in roles)
+        _check_vertices(model, stated, session)
+        if session.model_fingerprint and session.model_fingerprint != model.fingerprint:
+            decisions.append(
+                f"note: the session's vertices were chosen on the model {session.model_fingerprint}, "
+                f"this one is {model.fingerprint}"
+            )
+    else:
+        coils = preparation.all_frames(recording.positions)
+        found = estimate_correspondences(model, coils, roles, session.energy)
+        _check_vertices(model, stated, session)
+        vertices = tuple(stated.get(role, vertex) for role, vertex in zip(roles, found.vertices, strict=True))
+        decisions.append(f"correspondences (estimated): {found}")
+        if stated:
+            decisions.append(
+                f"correspondences (session): {', '.join(f'{r} = vertex {v}' for r, v in stated.items())}"
+            )
+    completed = replace(
+        session,
+        coils=dict(coil_map.roles),
+        correspondences=dict(zip(roles, vertices, strict=True)),
+        model_fingerprint=model.fingerprint,
+    )
+    return Setup(channels, roles, vertices, preparation, completed, tuple(decisions))
+
+
+def picked_channels(available: Sequence[str], channels: Sequence[str]) -> NDArray[np.int64]:
+    """(n,) the index of each channel among those a source has."""
+    return np.array([list(available).index(channel) for channel in channels], dtype=np.int64)
+
+
+def _coil_map(recording: Recording, session: Session) -> CoilMap:
+    if not session.coils:
+        return guess_coil_map(recording.coils, recording.positions, recording.source)
+    for channel in session.coils:
+        if channel not in recording.coils:
+            raise InputError(
+                f"{session.source}: [coils] names the channel '{channel}', which {recording.source} does not have; "
+                f"its channels are {', '.join(recording.coils)}."
+            )
+    return checked_coil_map(session.coils, session.source)
+
+
+def _check_speaker(model: TongueModel, session: Session) -> None:
+    weights = session.speaker_weights
+    if weights is not None and weights.shape != (model.speaker.size,):
+        raise InputError(
+            f"{session.source}: [speaker] has {weights.size} weights, but the model '{model.name}' has "
+            f"{model.speaker.size} speaker modes; it belongs to a model of other dimensions."
+        )
+
+
+def _check_vertices(model: TongueModel, stated: dict[str, int], session: Session) -> None:
+    for role, vertex in stated.items():
+        if not 0 <= vertex < model.vertex_count:
+            raise InputError(
+                f"{session.source}: [correspondences] {role} = {vertex}, but the model '{model.name}' has vertices "
+                f"0 to {model.vertex_count - 1}; it belongs to a model of other dimensions."
+            )
+
+
+def _frame_hints(recording: Recording, session: Session) -> list[str]:
+    """Says what the file's own frame would need, without doing it unasked."""
+    known = [recording.frame.x, recording.frame.y, recording.frame.z]
+    if not session.alignment.is_identity:
+        return []
+    axes = suggested_axes(recording.frame)
+    if axes is None:
+        return (
+            [f"note: the file's axes are {recording.frame}; an [alignment] may be needed"]
+            if "unknown" in known
+            else []
+        )
+    if np.array_equal(axis_mapping(axes), np.eye(3)):
+        return []
+    return [
+        f"note: the file's frame is {recording.frame}, the model's is {MODEL_FRAME}; "
+        f"unless the file was rotated already, [alignment] needs axes = {list(axes)}".replace("'", '"')
+    ]
+
+
+def suggested_axes(frame: FrameOfReference) -> tuple[str, str, str] | None:
+    """The [alignment] axes that turn a known frame's directions into the model's; None where unknown.
+
+    An axis that is absent (2-D data, filled with zeros) stands in for the missing direction.
+    """
+    opposite = {
+        "left": "right",
+        "right": "left",
+        "front": "back",
+        "back": "front",
+        "up": "down",
+        "down": "up",
+    }
+    directions = {"x": frame.x, "y": frame.y, "z": frame.z}
+    absent = [axis for axis, direction in directions.items() if direction == "absent"]
+    chosen = []
+    for wanted in (MODEL_FRAME.x, MODEL_FRAME.y, MODEL_FRAME.z):
+        same = [axis for axis, direction in directions.items() if direction == wanted]
+        turned = [axis for axis, direction in directions.items() if direction == opposite[wanted]]
+        if same:
+            chosen.append(same[0])
+        elif turned:
+            chosen.append(f"-{turned[0]}")
+        elif absent:
+            chosen.append(absent.pop())
+        else:
+            return None
+    return chosen[0], chosen[1], chosen[2]

@@ -1,0 +1,179 @@
+"""The paper's two experiments over a whole recording, and the same tracker one frame at a time."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .. import InputError
+from ..drivers.frames import CoilFrame, Recording
+from ..model.multilinear import SpeakerModel, TongueModel
+from .pose import FloatArray, PoseStatus, TrackedPose, TrackedPoses
+from .session import Session
+from .setup import Setup, complete_setup
+from .solver import FixedSpeakerSolver, FreeSpeakerSolver, SolvedFrames
+
+
+@dataclass(frozen=True)
+class TrackingRun:
+    """What tracking a recording gave. Experiment 1 is None where the session already knew the speaker.
+
+    setup: with the speaker's weights, so that `setup.session` reproduces experiment 2.
+    """
+
+    setup: Setup
+    speaker: SpeakerModel
+    experiment_1: TrackedPoses | None
+    experiment_2: TrackedPoses | None
+
+
+def track_recording(
+    recording: Recording,
+    model: TongueModel,
+    session: Session | None = None,
+    experiments: tuple[int, ...] = (1, 2),
+    setup: Setup | None = None,
+) -> TrackingRun:
+    """Tracks a whole recording in compiled loops.
+
+    Experiment 1 solves speaker and pose in every frame; the speaker is then the mean of its speaker
+    weights over the tracked frames, unless the session states one; experiment 2 solves the pose alone.
+    (Paper, section "Experiments".) `setup` is given where `complete_setup` was already called.
+    """
+    if recording.frame_count == 0:
+        raise InputError(f"{recording.source}: the recording has no frames.")
+    setup = setup or complete_setup(recording, model, session or Session())
+    energy = setup.session.energy
+    coils = setup.preparation.all_frames(recording.positions)
+    at_coils = model.at(setup.vertices)
+    free: SolvedFrames | None = None
+    if 1 in experiments or setup.session.speaker_weights is None:
+        free = FreeSpeakerSolver(at_coils, energy).solve_all(coils)
+        if not (free.statuses == PoseStatus.OK).any():
+            raise InputError(
+                f"{recording.source}: none of the tracked coils ({', '.join(setup.channels)}) has a position in "
+                "any frame."
+            )
+    setup = with_speaker(setup, model, free, recording)
+    weights = setup.session.speaker_weights
+    assert weights is not None
+    speaker = model.for_speaker(weights)
+    fixed = (
+        FixedSpeakerSolver(speaker.at(setup.vertices), energy).solve_all(coils) if 2 in experiments else None
+    )
+
+    def poses(experiment: int, solved: SolvedFrames, speakers: FloatArray, pose: FloatArray) -> TrackedPoses:
+        frames = len(coils)
+        held = (
+            energy.beta_speaker * float(np.sum((weights - model.speaker.mean) ** 2))
+            if experiment == 2
+            else 0.0
+        )
+        fitted = at_coils.origin + np.einsum("tl,tk,lkr->tr", speakers, pose, at_coils.core, optimize=True)
+        return TrackedPoses(
+            times_s=recording.times_s,
+            statuses=solved.statuses,
+            weights=pose,
+            normalised=model.pose.normalised(pose),
+            speaker_weights=speakers,
+            energies=solved.results[:, 0] + held,
+            residual_mm=solved.results[:, 1],
+            residuals_mm=solved.residuals_mm,
+            coils=coils,
+            vertices=fitted.reshape(frames, -1, 3),
+            roles=setup.roles,
+            correspondences=setup.vertices,
+            experiment=experiment,
+            rate_hz=recording.rate_hz,
+            model_fingerprint=model.fingerprint,
+            model_name=model.name,
+            recording=recording.source,
+        )
+
+    speaker_size = model.speaker.size
+    first = second = None
+    if free is not None and 1 in experiments:
+        first = poses(
+            1, free, free.weights[:, :speaker_size], np.ascontiguousarray(free.weights[:, speaker_size:])
+        )
+    if fixed is not None:
+        second = poses(2, fixed, np.broadcast_to(weights, (len(coils), speaker_size)), fixed.weights)
+    return TrackingRun(setup, speaker, first, second)
+
+
+def with_speaker(setup: Setup, model: TongueModel, free: SolvedFrames | None, recording: Recording) -> Setup:
+    """The set-up with the session's speaker, or else the mean over experiment 1's tracked frames."""
+    if setup.session.speaker_weights is not None:
+        source = setup.session.speaker_source or setup.session.source
+        return replace(setup, decisions=(*setup.decisions, f"speaker (session): {source}"))
+    assert free is not None
+    tracked = free.statuses == PoseStatus.OK
+    weights = free.weights[tracked, : model.speaker.size].mean(axis=0)
+    source = f"mean of experiment 1 over {int(tracked.sum())} frames of {recording.source}"
+    session = replace(setup.session, speaker_weights=weights, speaker_source=source)
+    shown = ", ".join(f"{value:+.2f}" for value in model.speaker.normalised(weights))
+    return replace(
+        setup,
+        session=session,
+        decisions=(*setup.decisions, f"speaker (estimated): {source}; in sigma {shown}"),
+    )
+
+
+class Tracker:
+    """Frame in, pose out: prepares and solves one frame in compiled code, allocating nothing.
+
+    It owns one `TrackedPose` and writes over it at every step. With `setup.session.speaker_weights` the
+    speaker is fixed and only the pose is solved; without, both are.
+    """
+
+    def __init__(self, model: TongueModel, setup: Setup) -> None:
+        self._preparation = setup.preparation
+        weights = setup.session.speaker_weights
+        at_coils = model.at(setup.vertices)
+        self._solver: FixedSpeakerSolver | FreeSpeakerSolver
+        if weights is None:
+            self.speaker: SpeakerModel | None = None
+            self._solver = FreeSpeakerSolver(at_coils, setup.session.energy)
+        else:
+            self.speaker = model.for_speaker(weights)
+            self._solver = FixedSpeakerSolver(self.speaker.at(setup.vertices), setup.session.energy)
+        self._mean = model.pose.mean
+        self._sigma = model.pose.sigma
+        self.pose = TrackedPose(
+            weights=self._solver.pose_weights,
+            normalised=model.pose.normalised(self._solver.pose_weights),
+            speaker_weights=self._solver.speaker_weights,
+            residuals_mm=self._solver.residuals_mm,
+        )
+
+    @property
+    def coils(self) -> FloatArray:
+        """(n, 3) the last frame's prepared coils, mm in the model frame, NaN = missing."""
+        return self._preparation.coils
+
+    def warm_up(self) -> None:
+        """Compiles or loads the kernels on a frame without coils, so that the first real one is not late."""
+        self._solver.solve(np.full_like(self._preparation.coils, np.nan))
+        self._preparation.frame(np.zeros((self._preparation.channels_needed, 3)))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the previous frame, as after a jump in time."""
+        self._solver.reset()
+
+    def step(self, frame: CoilFrame) -> TrackedPose:
+        """Tracks one frame of the source's raw positions (coils, 3), mm."""
+        pose = self.pose
+        coils = self._preparation.frame(frame.positions)
+        pose.status = self._solver.solve(coils)
+        np.subtract(pose.weights, self._mean, out=pose.normalised)
+        np.divide(pose.normalised, self._sigma, out=pose.normalised)
+        pose.energy, pose.residual_mm = self._solver.result
+        pose.valid_coils = len(coils) - int(np.count_nonzero(np.isnan(coils[:, 0])))
+        pose.device_time_s = frame.device_time_s
+        pose.frame_number = frame.frame_number
+        pose.arrival_ns = frame.arrival_ns
+        pose.solved_ns = time.perf_counter_ns()
+        return pose
