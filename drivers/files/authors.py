@@ -5,7 +5,8 @@
 
 JSON has no NaN, and the authors' programs expect a number everywhere. A missing sample is therefore
 written as the coil's last known position (before the first, its first; for a coil without any, zeros)
-with an RMS of -1, which no fit error can be; reading turns a negative RMS, or null, into NaN. Where a
+with an RMS of -1, which no fit error can be; reading turns a negative RMS, null, or a position of exactly
+(0, 0, 0) into NaN. Where a
 recording has no fit error RMS is 0 throughout, and is read as "not in the file". The format states no
 axes; orientations, notes and the frame of reference do not fit into it.
 """
@@ -19,7 +20,7 @@ import numpy as np
 
 from ... import InputError
 from ..frames import FloatArray, Recording
-from .common import Options, check_rate, clean, coverage_notes, frame_times
+from .common import Options, check_rate, clean, coverage_notes, frame_times, without_padding
 
 MISSING_RMS = -1.0
 
@@ -70,6 +71,8 @@ def parse_authors(data: bytes, name: str, options: Options) -> Recording:
     points[fit < 0] = np.nan
     fit = np.where(fit < 0, np.nan, fit)
     points, notes = clean(points)
+    points, padding = without_padding(points)
+    notes += padding
     stated = content.get("samplingFrequency")
     if isinstance(stated, int | float) and not isinstance(stated, bool):
         stated = check_rate(stated if abs(stated) < 1e9 else 0.0, name)

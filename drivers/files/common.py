@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -197,12 +198,24 @@ def clean(positions: FloatArray) -> tuple[FloatArray, list[str]]:
     one axis is missing is missing.
     """
     with np.errstate(invalid="ignore"):
-        impossible = np.isinf(positions) | (np.abs(positions) > LARGEST_POSITION_MM)
-    bad = (impossible | np.isnan(positions)).any(axis=2)
-    cleaned = np.where(bad[:, :, None], np.nan, positions)
-    number = int(impossible.any(axis=2).sum())
+        impossible = np.abs(positions) > LARGEST_POSITION_MM  # an infinity included
+    bad = np.any(impossible | np.isnan(positions), axis=2, keepdims=True)
+    cleaned = np.where(bad, np.nan, positions)
+    number = int(np.any(impossible, axis=2).sum())
     notes = [f"{number} sample(s) hold impossible numbers and were taken as missing."] if number else []
     return cleaned, notes
+
+
+def without_padding(positions: FloatArray) -> tuple[FloatArray, list[str]]:
+    """Positions with every sample at exactly (0, 0, 0) missing, and a note if there are any.
+
+    Converters fill the frames that a coil lacks with zeros; a measured coil is never exactly there.
+    """
+    zero = np.asarray((positions == 0).all(axis=2))
+    if not zero.any():
+        return positions, []
+    note = f"{int(zero.sum())} sample(s) at exactly 0 0 0 are padding and were taken as missing."
+    return np.where(zero[:, :, None], np.nan, positions), [note]
 
 
 def coverage_notes(coils: Sequence[str], positions: FloatArray) -> list[str]:
@@ -226,8 +239,6 @@ def plausible_unit(positions: FloatArray, candidates: Sequence[str]) -> str | No
     The distance judged is the largest extent, over the axes, of the coils' median positions:
     between 25 and 400 mm with reference coils, hardly less than 25 mm from lips to tongue back.
     """
-    import warnings
-
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)
         middle = np.nanmedian(positions, axis=0)

@@ -27,6 +27,7 @@ from .common import (
     parse_count,
     parse_number,
     unit_vectors,
+    without_padding,
 )
 
 TYPES = {"DOUBLE": "f8", "FLOAT": "f4", "SHORT": "i2", "LONG": "i4", "BYTE": "i1", "CHAR": "i1"}
@@ -169,7 +170,8 @@ def parse_group(tracks: Mapping[str, Track], name: str, options: Options) -> Rec
         chosen = options.layout or "raw"
         notes.append(f"The files hold raw and filtered columns; the {chosen} ones were read (--layout).")
     positions, more = clean(np.stack([coil.positions for coil in coils], axis=1))
-    notes += more
+    positions, padding = without_padding(positions)
+    notes += more + padding
     axes = None
     if any(coil.axes is not None for coil in coils):
         nothing = np.full((main.frames, 3), np.nan)

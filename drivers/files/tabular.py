@@ -14,7 +14,8 @@ import io
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -43,7 +44,19 @@ _COLUMN = re.compile(
 _TIME = re.compile(
     r"(?:time|timestamp|t|wav ?time|audiotime)(?:[ _]?[\[(]?(?P<unit>s|sec|ms|us)[\])]?)?", re.IGNORECASE
 )
+UNSTATED = FrameOfReference()
 _SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6}
+
+
+@dataclass(frozen=True, slots=True)
+class _Stated:
+    """What the comment lines of a table of ours say; nothing, for a foreign one."""
+
+    unit: str | None = None
+    rate_hz: float | None = None
+    frame: FrameOfReference = UNSTATED
+    notes: tuple[str, ...] = ()
+    extra: Mapping[str, str] = field(default_factory=dict)
 
 
 def is_ours(head: str) -> bool:
@@ -74,7 +87,7 @@ def parse_table(data: bytes, name: str, options: Options) -> Recording:
     comments = 0
     while comments < len(lines) and (lines[comments].startswith("#") or not lines[comments].strip()):
         comments += 1
-    stated = _stated(lines[:comments], name) if ours else {}
+    stated = _stated(lines[:comments], name) if ours else _Stated()
     if comments == len(lines):
         raise InputError(f"{name}: no header line with column names was found; the file is cut short.")
     try:
@@ -86,7 +99,7 @@ def parse_table(data: bytes, name: str, options: Options) -> Recording:
         raise InputError(f"{name}: no frame follows the column names.")
     table = number_table(body, len(header), name, comments + 2)
     fields, column_unit, time_column = _sort_columns(header, name)
-    notes = [str(note) for note in stated.get("notes", [])]
+    notes = list(stated.notes)
     coils = tuple(coil for coil, found in fields.items() if {"y", "z"} <= set(found))
     flat = [coil for coil, found in fields.items() if {"x", "y"} == set(found) & {"x", "y", "z"}]
     if flat or not coils:
@@ -101,14 +114,14 @@ def parse_table(data: bytes, name: str, options: Options) -> Recording:
     for k, coil in enumerate(coils):
         for axis in range(0 if depth[0] else 1, 3):
             positions[:, k, axis] = table[:, fields[coil]["xyz"[axis]]]
-    unit = stated.get("unit") or options.unit or column_unit
+    unit = stated.unit or options.unit or column_unit
     if unit not in UNITS_MM:
         raise InputError(f"{name}: the table states no unit; pass it with --unit ({', '.join(UNITS_MM)}).")
     positions, more = clean(positions * UNITS_MM[unit] if unit != "mm" else positions)
     notes += more
     times, rate, more = _times(table, time_column, stated, name, options)
     notes += more
-    frame = stated.get("frame") or FrameOfReference()
+    frame = stated.frame
     if not ours:
         notes.append("The table states no axes.")
         if not depth[0]:
@@ -120,7 +133,7 @@ def parse_table(data: bytes, name: str, options: Options) -> Recording:
         orientations=_block(table, fields, coils, ("ox", "oy", "oz")),
         quaternions=_block(table, fields, coils, ("qw", "qx", "qy", "qz")),
         rms=_single(_block(table, fields, coils, ("rms",))), source=name, notes=tuple(notes),
-        extra=stated.get("extra", {}),
+        extra=stated.extra,
     )  # fmt: skip
 
 
@@ -149,14 +162,13 @@ def _sort_columns(
 def _times(
     table: FloatArray,
     column: tuple[int, str | None] | None,
-    stated: dict[str, object],
+    stated: _Stated,
     name: str,
     options: Options,
 ) -> tuple[FloatArray, float, list[str]]:
-    nominal = stated.get("rate_hz")
-    if isinstance(nominal, float) and column is not None:
-        times, _, notes = frame_times(table[:, column[0]], name, nominal)
-        return times, nominal, [note for note in notes if "gap" not in note]
+    if stated.rate_hz is not None and column is not None:
+        times, _, notes = frame_times(table[:, column[0]], name, stated.rate_hz)
+        return times, stated.rate_hz, [note for note in notes if "gap" not in note]
     if column is not None:
         seconds = _SECONDS[column[1]] if column[1] else 1.0
         times, rate, notes = frame_times(table[:, column[0]] * seconds, name, options.rate_hz)
@@ -194,24 +206,24 @@ def _single(block: FloatArray | None) -> FloatArray | None:
 # Ours -----------------------------------------------------------------------------------------------
 
 
-def _stated(lines: Sequence[str], name: str) -> dict[str, object]:
+def _stated(lines: Sequence[str], name: str) -> _Stated:
     """What the comment lines of our own files say."""
-    found: dict[str, object] = {"notes": [], "extra": {}}
+    unit, rate, frame = None, None, UNSTATED
     notes: list[str] = []
     extra: dict[str, str] = {}
     for line in lines:
         key, _, value = line[1:].strip().partition(": ")
         if key == "unit":
-            found["unit"] = value
+            unit = value
         elif key == "rate_hz":
-            found["rate_hz"] = check_rate(parse_number(value, name, "rate_hz in the comments"), name)
+            rate = check_rate(parse_number(value, name, "rate_hz in the comments"), name)
         elif key == "frame":
-            found["frame"] = frame_from_text(value, name)
+            frame = frame_from_text(value, name)
         elif key == "note":
             notes.append(value)
         elif key.startswith("extra "):
             extra[key[6:]] = value
-    return found | {"notes": notes, "extra": extra}
+    return _Stated(unit, rate, frame, tuple(notes), extra)
 
 
 def frame_from_text(text: str, name: str) -> FrameOfReference:
