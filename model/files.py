@@ -129,7 +129,9 @@ def _model_from_npz(data: bytes) -> TongueModel:
         raise InputError(f"it would unpack to {unpacked} bytes, which is too much for a model.")
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         if "header" not in arrays:
-            raise InputError("this .npz is not a tongue model (it has no 'header'); make one with 'model build'.")
+            raise InputError(
+                "this .npz is not a tongue model (it has no 'header'); make one with 'model build'."
+            )
         header = json.loads(arrays["header"].tobytes().decode())
         if header.get("format") != FORMAT_NAME:
             raise InputError(f"this .npz holds '{header.get('format')}', not a '{FORMAT_NAME}'.")
@@ -213,7 +215,9 @@ def _model_from_published(content: Any, name: str) -> TongueModel:
     shape = (sizes["TruncatedSpeakerMode"], sizes["TruncatedPhonemeMode"], sizes["VertexMode"])
     core = _core_values(content["CoreTensor"])
     if min(shape) < 1 or core.size != shape[0] * shape[1] * shape[2]:
-        raise InputError(f"CoreTensor holds {core.size} numbers, but Dimensions say {shape[0]} x {shape[1]} x {shape[2]}.")
+        raise InputError(
+            f"CoreTensor holds {core.size} numbers, but Dimensions say {shape[0]} x {shape[1]} x {shape[2]}."
+        )
     means = content["MeanWeights"]
     model = TongueModel(
         core.reshape(shape),

@@ -39,7 +39,9 @@ def read_mesh(path: str | Path) -> Mesh:
     import trimesh  # 0.7 s: only when a mesh is really read
 
     try:
-        loaded: Any = trimesh.load(path, process=False, maintain_order=True, force="mesh", skip_materials=True)
+        loaded: Any = trimesh.load(
+            path, process=False, maintain_order=True, force="mesh", skip_materials=True
+        )
         vertices = np.ascontiguousarray(loaded.vertices, dtype=np.float64)
         faces = np.ascontiguousarray(loaded.faces, dtype=np.int32)
     except Exception as reason:  # the parser raises whatever a damaged file makes it stumble over
@@ -47,9 +49,13 @@ def read_mesh(path: str | Path) -> Mesh:
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or len(vertices) == 0:
         raise InputError(f"{path}: expected vertices with three coordinates and triangles, found none.")
     if not np.isfinite(vertices).all():
-        raise InputError(f"{path}: vertex {int(np.argmin(np.isfinite(vertices).all(axis=1)))} is not a number.")
+        raise InputError(
+            f"{path}: vertex {int(np.argmin(np.isfinite(vertices).all(axis=1)))} is not a number."
+        )
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise InputError(f"{path}: a face names vertex {faces.max()}, but there are {len(vertices)} vertices.")
+        raise InputError(
+            f"{path}: a face names vertex {faces.max()}, but there are {len(vertices)} vertices."
+        )
     return Mesh(vertices, faces)
 
 

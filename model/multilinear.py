@@ -206,7 +206,9 @@ class TongueModel:
         """Keeps the leading weights of both modes."""
         for wanted, mode, name in ((speaker_modes, self.speaker, "speaker"), (pose_modes, self.pose, "pose")):
             if not 1 <= wanted <= mode.size:
-                raise InputError(f"{wanted} {name} modes were asked for; the model '{self.name}' has {mode.size}.")
+                raise InputError(
+                    f"{wanted} {name} modes were asked for; the model '{self.name}' has {mode.size}."
+                )
         return replace(
             self,
             core=self.core[:speaker_modes, :pose_modes],

@@ -55,8 +55,9 @@ class TrackedPoses:
 
     times_s, statuses, energies, residual_mm: (frames,); weights, normalised: (frames, K);
     speaker_weights: (frames, m), equal rows while the speaker is fixed;
-    residuals_mm: (frames, n), NaN = missing; coils, vertices: (frames, n, 3) mm in the model frame:
-    the prepared coil positions and the model's points that they were fitted to.
+    residuals_mm: (frames, n), NaN = missing; coils: (frames, n, 3) the prepared coil positions, mm in the
+    model frame; vertices: the same shape, the model's points that they were fitted to, or None where a
+    file does not keep them.
     roles: the coils' roles in the order of the n axis; correspondences: their vertices, in that order.
     experiment: 1 (speaker and pose free) or 2 (speaker fixed).
     """
@@ -70,7 +71,7 @@ class TrackedPoses:
     residual_mm: FloatArray
     residuals_mm: FloatArray
     coils: FloatArray
-    vertices: FloatArray
+    vertices: FloatArray | None
     roles: tuple[str, ...]
     correspondences: tuple[int, ...]
     experiment: int

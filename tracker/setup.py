@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -139,7 +140,7 @@ def _frame_hints(recording: Recording, session: Session) -> list[str]:
         return []
     return [
         f"note: the file's frame is {recording.frame}, the model's is {MODEL_FRAME}; "
-        f"unless the file was rotated already, [alignment] needs axes = {list(axes)}".replace("'", '"')
+        f"unless the file was rotated already, [alignment] needs axes = {json.dumps(axes)}"
     ]
 
 

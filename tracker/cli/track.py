@@ -1,0 +1,376 @@
+"""tonguetrack track and tonguetrack mesh: recordings in, poses and meshes out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ... import InputError
+
+if TYPE_CHECKING:
+    from ...drivers.frames import Recording
+    from ...model.multilinear import TongueModel
+    from ..pose import TrackedPoses
+    from ..session import Session
+    from ..tracking import TrackingRun
+
+BUNDLED = "bundled"
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    track = commands.add_parser("track", help="track recordings: poses to a file, live over OSC")
+    track.add_argument(
+        "recordings", nargs="+", metavar="RECORDING", help="files, or folders that are searched"
+    )
+    track.add_argument(
+        "--model", default=BUNDLED, help="the tongue model (default: the bundled synthetic one)"
+    )
+    track.add_argument("--session", metavar="FILE", help="the speaker's session file (TOML)")
+    track.add_argument("--experiment", choices=("1", "2", "both"), default="2",
+                       help="1: anatomy and pose free in every frame; 2: anatomy fixed (default)")  # fmt: skip
+    track.add_argument("--out", metavar="FILE", help="poses.csv, .json (as the authors' tracker writes) or .npz; "
+                       "for several recordings a folder, or a name with {name} in it")  # fmt: skip
+    track.add_argument("--save-session", metavar="FILE",
+                       help="write the session with everything that was estimated, to be edited and used again")  # fmt: skip
+    track.add_argument(
+        "--coils", metavar="CHANNEL=ROLE,...", help="which channel is which coil, where names do not tell"
+    )
+    track.add_argument("--osc", metavar="HOST:PORT", help="also stream the poses over OSC")
+    track.add_argument("--realtime", action="store_true", help="stream at the recording's own pace")
+    track.add_argument("--json", action="store_true", help="the summary as JSON on stdout")
+    add_recording_flags(track)
+    track.set_defaults(run=run_track)
+
+    mesh = commands.add_parser("mesh", help="meshes of tracked frames")
+    mesh.add_argument("poses", metavar="POSES", help="what 'track --out' wrote")
+    which = mesh.add_mutually_exclusive_group(required=True)
+    which.add_argument("--frame", type=int, metavar="N", help="one frame, counted from 0")
+    which.add_argument(
+        "--every", type=int, metavar="K", help="every K-th frame, numbered: tongue_000000.ply, ..."
+    )
+    mesh.add_argument("-o", "--output", required=True, metavar="FILE", help="tongue.ply or tongue.obj")
+    mesh.add_argument("--model", help="the model, where it is not where the poses say")
+    mesh.set_defaults(run=run_mesh)
+
+
+def add_recording_flags(parser: argparse.ArgumentParser) -> None:
+    """What a person may have to say about a file that does not say it itself."""
+    parser.add_argument(
+        "--rate", type=float, metavar="HZ", help="the sampling rate, where the file does not state it"
+    )
+    parser.add_argument(
+        "--unit", help="the unit of positions, where the file does not state it (mm, cm, m, um)"
+    )
+    parser.add_argument("--layout", help="the column layout, where the format leaves it open")
+
+
+# track ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording to track, and where its poses go (experiment -> file)."""
+
+    path: Path
+    outputs: dict[int, Path]
+
+
+def run_track(args: argparse.Namespace) -> int:
+    experiments = (1, 2) if args.experiment == "both" else (int(args.experiment),)
+    jobs, left_out = plan_jobs(args.recordings, args.out, experiments)
+    if len(jobs) > 1 and (args.osc or args.save_session):
+        flag = "--osc" if args.osc else "--save-session"
+        raise InputError(f"{flag} takes one recording; {len(jobs)} were found. Track them one by one.")
+    if args.realtime and not args.osc:
+        raise InputError("--realtime paces a stream; say where to with --osc HOST:PORT.")
+    if args.osc:
+        from ..streams.osc import parse_destination
+
+        parse_destination(args.osc)
+    model = named_model(args.model)
+    session = read_session(args)
+    print(f"model: {model.name} [{model.fingerprint}]", file=sys.stderr)
+    for path, reason in left_out:
+        print(f"left out: {path}: {reason}", file=sys.stderr)
+    for file in (output for job in jobs for output in job.outputs.values()):
+        file.parent.mkdir(parents=True, exist_ok=True)
+
+    reports: list[dict[str, Any]] = []
+    failures = 0
+    for job in _with_progress(jobs):
+        try:
+            report = _track_one(job, args, model, session, experiments)
+        except InputError as reason:
+            if len(jobs) == 1:
+                raise
+            failures += 1
+            print(f"tonguetrack: {reason}", file=sys.stderr)
+            reports.append({"recording": str(job.path), "error": str(reason)})
+        else:
+            reports.append(report)
+    if args.json:
+        print(
+            json.dumps({"model": model.name, "model_fingerprint": model.fingerprint, "recordings": reports})
+        )
+    if failures:
+        print(f"tonguetrack: {failures} of {len(jobs)} recordings could not be tracked.", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _track_one(
+    job: Job, args: argparse.Namespace, model: TongueModel, session: Session, experiments: tuple[int, ...]
+) -> dict[str, Any]:
+    from ...atomic import write_atomically
+    from ...drivers import open_recording
+    from ..posefiles import write_poses
+    from ..session import session_toml
+    from ..tracking import track_recording
+
+    recording = open_recording(job.path, rate_hz=args.rate, unit=args.unit, layout=args.layout)
+    run = track_recording(recording, model, session, experiments)
+    report = summarise(run, recording, model)
+    _print_report(report)
+    model_path = BUNDLED if args.model == BUNDLED else str(Path(args.model).resolve())
+    for poses in (run.experiment_1, run.experiment_2):
+        if poses is not None and poses.experiment in job.outputs:
+            write_poses(replace(poses, model_path=model_path), model, job.outputs[poses.experiment])
+            print(f"  written: {job.outputs[poses.experiment]}", file=sys.stderr)
+    if args.save_session:
+        write_atomically(args.save_session, session_toml(run.setup.session).encode())
+        print(f"  written: {args.save_session}", file=sys.stderr)
+    if args.osc:
+        from ..live import stream_recording
+
+        setup = run.setup
+        if args.experiment == "1":
+            setup = replace(setup, session=replace(setup.session, speaker_weights=None))
+        report["stream"] = stream_recording(
+            recording, model, setup, destination=args.osc, realtime=args.realtime
+        ).as_dict()
+    if not job.outputs and not args.osc:
+        print("  nothing was written; add --out poses.csv or --osc HOST:PORT", file=sys.stderr)
+    return report
+
+
+def plan_jobs(
+    places: Sequence[str], out: str | None, experiments: tuple[int, ...]
+) -> tuple[list[Job], list[tuple[Path, str]]]:
+    """Finds the recordings and gives each its output files; also what was left out, with the reason.
+
+    Raises InputError where there is nothing to track or two outputs would have one name.
+    """
+    from ...drivers import find_recordings
+
+    found: list[Path] = []
+    left_out: list[tuple[Path, str]] = []
+    for place in places:
+        if not Path(place).is_dir():
+            found.append(Path(place))
+            continue
+        items = find_recordings(place)
+        recordings = [item.path for item in items if item.is_recording]
+        if not recordings:
+            raise InputError(
+                f"{place}: no recording in this folder; 'tonguetrack info {place}' says what there is."
+            )
+        found.extend(recordings)
+        left_out.extend((item.path, item.left_out) for item in items if not item.is_recording)
+    if out is None:
+        return [Job(path, {}) for path in found], left_out
+    pattern = _output_pattern(out, len(found))
+    jobs = []
+    taken: dict[Path, Path] = {}
+    for path in found:
+        outputs = {}
+        for experiment in experiments:
+            file = Path(pattern.replace("{name}", path.stem))
+            if len(experiments) > 1:
+                file = file.with_name(f"{file.stem}.experiment{experiment}{file.suffix}")
+            if file in taken:
+                raise InputError(
+                    f"{path} and {taken[file]} would both be written to {file}; track them one by one."
+                )
+            taken[file] = path
+            outputs[experiment] = file
+        jobs.append(Job(path, outputs))
+    return jobs, left_out
+
+
+def _output_pattern(out: str, recordings: int) -> str:
+    from ..posefiles import check_pose_suffix
+
+    if Path(out).is_dir() or out.endswith("/"):
+        return str(Path(out) / "{name}.csv")
+    check_pose_suffix(out)
+    if recordings > 1 and "{name}" not in out:
+        raise InputError(
+            f"--out {out}: {recordings} recordings were found; give a folder, or a name with {{name}} in it "
+            "such as 'poses/{name}.csv'."
+        )
+    return out
+
+
+def named_model(name: str) -> TongueModel:
+    """The bundled model, or the one in a file."""
+    if name == BUNDLED:
+        from ..bundled import bundled_model
+
+        return bundled_model()
+    from ...model.files import load_model
+
+    return load_model(name)
+
+
+def read_session(args: argparse.Namespace) -> Session:
+    """The session file, with what --coils says on top."""
+    from ..coilmap import checked_coil_map
+    from ..session import Session, load_session
+
+    session = load_session(args.session) if args.session else Session()
+    if not args.coils:
+        return session
+    pairs = [pair.partition("=") for pair in args.coils.replace(" ", "").split(",") if pair]
+    if any(not channel or not role for channel, _, role in pairs):
+        raise InputError(f"--coils {args.coils}: expected CHANNEL=ROLE pairs with commas between them.")
+    coils = {channel: role for channel, _, role in pairs}
+    if len(coils) != len(pairs):
+        raise InputError(f"--coils {args.coils}: a channel is named twice.")
+    checked_coil_map(coils, "--coils")
+    return replace(session, coils=coils, source=session.source if args.session else "--coils")
+
+
+def summarise(run: TrackingRun, recording: Recording, model: TongueModel) -> dict[str, Any]:
+    """What a person judges a tracked recording by, as plain values."""
+    report: dict[str, Any] = {
+        "recording": recording.source,
+        "format": recording.format,
+        "frames": recording.frame_count,
+        "rate_hz": recording.rate_hz,
+        "decisions": [*recording.notes, *run.setup.decisions],
+    }
+    for poses in (run.experiment_1, run.experiment_2):
+        if poses is not None:
+            report[f"experiment_{poses.experiment}"] = _figures(poses, run.setup.session.energy.box, model)
+    return report
+
+
+def _figures(poses: TrackedPoses, box: float, model: TongueModel) -> dict[str, Any]:
+    import numpy as np
+
+    tracked = poses.tracked
+    residual = poses.residual_mm[tracked]
+    weights = poses.normalised[tracked]
+    if poses.experiment == 1:
+        weights = np.column_stack([model.speaker.normalised(poses.speaker_weights[tracked]), weights])
+    by_coil = {
+        role: float(np.nanmean(poses.residuals_mm[:, index]))
+        for index, role in enumerate(poses.roles)
+        if np.isfinite(poses.residuals_mm[:, index]).any()
+    }
+    return {
+        "frames_tracked": int(tracked.sum()),
+        "frames_held": int((poses.statuses == 2).sum()),
+        "residual_mean_mm": float(residual.mean()),
+        "residual_median_mm": float(np.median(residual)),
+        "share_below_1_25_mm": float((residual < 1.25).mean()),
+        "share_below_1_5_mm": float((residual < 1.5).mean()),
+        "residual_by_coil_mm": by_coil,
+        "largest_weight_sigma": float(np.abs(weights).max()),
+        "share_of_frames_at_the_box": float((np.abs(weights) > box - 1e-9).any(axis=1).mean()),
+    }
+
+
+def _print_report(report: dict[str, Any]) -> None:
+    out = sys.stderr
+    print(
+        f"{report['recording']}: {report['format']}, {report['frames']} frames, {report['rate_hz']:g} Hz",
+        file=out,
+    )
+    for decision in report["decisions"]:
+        print(f"  {decision}", file=out)
+    for experiment in ("experiment_1", "experiment_2"):
+        if experiment not in report:
+            continue
+        figures = report[experiment]
+        coils = ", ".join(f"{role} {value:.2f}" for role, value in figures["residual_by_coil_mm"].items())
+        held = f", {figures['frames_held']} held" if figures["frames_held"] else ""
+        print(
+            f"  {experiment.replace('_', ' ')}: {figures['frames_tracked']} frames tracked{held}; residual mean "
+            f"{figures['residual_mean_mm']:.2f} mm ({coils}), {100 * figures['share_below_1_25_mm']:.0f} % below "
+            f"1.25 mm, {100 * figures['share_below_1_5_mm']:.0f} % below 1.5 mm; largest weight "
+            f"{figures['largest_weight_sigma']:.1f} sigma, {100 * figures['share_of_frames_at_the_box']:.0f} % of "
+            "frames at the box",
+            file=out,
+        )
+        if figures["residual_mean_mm"] > 5.0:
+            print(
+                "  warning: residuals of this size mean that the recording is not in the model's frame; "
+                "see [alignment] in docs/session.md",
+                file=out,
+            )
+
+
+def _with_progress(jobs: list[Job]) -> Any:
+    """The jobs one after the other, with a progress bar where there are several and a person to see it."""
+    if len(jobs) == 1 or not sys.stderr.isatty():
+        return jobs
+    from rich.console import Console
+    from rich.progress import track as progress
+
+    return progress(jobs, description="tracking", console=Console(stderr=True))
+
+
+# mesh -----------------------------------------------------------------------------------------------
+
+
+def run_mesh(args: argparse.Namespace) -> int:
+    from ...atomic import write_atomically
+    from ...model.mesh import MESH_SUFFIXES, Mesh, mesh_bytes
+    from ..posefiles import read_poses
+
+    target = Path(args.output)
+    if target.suffix.lower() not in MESH_SUFFIXES:
+        raise InputError(
+            f"{target}: meshes are written as {' or '.join(MESH_SUFFIXES)}; end the name in one of them."
+        )
+    given = named_model(args.model) if args.model else None
+    poses = read_poses(args.poses, given)
+    model = given or _model_of(poses, Path(args.poses))
+    if poses.model_fingerprint and poses.model_fingerprint != model.fingerprint:
+        raise InputError(
+            f"{args.poses}: the poses were tracked with the model {poses.model_name} [{poses.model_fingerprint}], "
+            f"but {model.name} is [{model.fingerprint}]; name the right one with --model."
+        )
+    if args.frame is not None:
+        if not 0 <= args.frame < poses.frame_count:
+            raise InputError(
+                f"--frame {args.frame}: {args.poses} has the frames 0 to {poses.frame_count - 1}."
+            )
+        frames = [args.frame]
+    else:
+        if args.every < 1:
+            raise InputError(f"--every {args.every}: expected 1 or more.")
+        frames = list(range(0, poses.frame_count, args.every))
+    for frame in frames:
+        mesh = Mesh(model.vertices(poses.speaker_weights[frame], poses.weights[frame]), model.faces)
+        numbered = target.with_name(f"{target.stem}_{frame:06d}{target.suffix}")
+        write_atomically(target if args.frame is not None else numbered, mesh_bytes(mesh, target.suffix))
+    written = str(target) if args.frame is not None else f"{len(frames)} meshes beside {target}"
+    print(f"written: {written} ({model.name}, {model.vertex_count} vertices, mm)", file=sys.stderr)
+    return 0
+
+
+def _model_of(poses: TrackedPoses, source: Path) -> TongueModel:
+    if not poses.model_path:
+        raise InputError(f"{source}: it does not say which model it belongs to; name it with --model.")
+    if poses.model_path != BUNDLED and not Path(poses.model_path).is_file():
+        raise InputError(
+            f"{source}: its model {poses.model_path} is not there any more; name it with --model."
+        )
+    return named_model(poses.model_path)
