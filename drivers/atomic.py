@@ -21,7 +21,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes | Callable[[Bi
     an exception raised by `content` passes through and leaves nothing behind.
     """
     target = Path(os.path.realpath(path))
-    if target.is_dir():
+    if os.path.isdir(target):  # unlike Path.is_dir, quiet about impossible names
         raise InputError(f"{path}: this is a folder; give the name of a file to write.")
     temporary = target.with_name(f".{target.name[:80]}.{secrets.token_hex(4)}.part")
     try:

@@ -38,9 +38,9 @@ def find_recordings(path: str | os.PathLike[str]) -> list[Found]:
     nothing at `path`, or only an empty folder.
     """
     root = Path(path)
-    if not root.is_dir():
+    if not os.path.isdir(root):
         read_head(root)
-    files = sorted(_files(root)) if root.is_dir() else [root]
+    files = sorted(_files(root)) if os.path.isdir(root) else [root]
     if not files:
         raise InputError(f"{root}: the folder is empty.")
     found: list[Found] = []

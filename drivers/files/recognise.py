@@ -194,7 +194,7 @@ def open_recording(
     assumed. Raises InputError, one sentence, naming the flag to pass where the file is ambiguous.
     """
     path = Path(path)
-    if path.is_dir():
+    if os.path.isdir(path):  # unlike Path.is_dir, quiet about impossible names
         path = _only_recording(path)
     options = Options(rate_hz, unit, layout)
     form = recognise(read_head(path), str(path))
@@ -220,7 +220,11 @@ def read_ssff_group(path: Path) -> dict[str, ssff.Track]:
     A sibling that is damaged raises InputError: a coil must not vanish silently.
     """
     tracks = {path.suffix.removeprefix("."): ssff.parse_track(read_whole(path), str(path))}
-    for other in sorted(path.parent.iterdir()):
+    try:
+        neighbours = sorted(path.parent.iterdir())
+    except OSError as error:
+        raise InputError(f"{path.parent}: cannot be listed ({error.strerror or error}).") from error
+    for other in neighbours:
         sibling = other.stem == path.stem and other.name != path.name and other.is_file()
         if sibling and ssff.is_ssff(read_head(other).data):
             tracks[other.suffix.removeprefix(".")] = ssff.parse_track(read_whole(other), str(other))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +43,7 @@ def run_info(args: argparse.Namespace) -> int:
     """Print what is known about a file or folder."""
     import json
 
-    if Path(args.file).is_dir():
+    if os.path.isdir(args.file):
         from ...drivers import find_recordings
 
         found = find_recordings(args.file)
