@@ -168,7 +168,8 @@ def folder_text(root: str, found: list[Found]) -> str:
     others = [item for item in found if not item.is_recording]
     lines = [f"{root}: {len(recordings)} recording(s), {len(others)} other file(s)"]
     for item in recordings:
-        several = f" ({len(item.files)} files)" if len(item.files) > 1 else ""
+        suffixes = " ".join(file.suffix for file in item.files)
+        several = f" ({len(item.files)} files: {suffixes})" if len(item.files) > 1 else ""
         lines.append(f"  {item.path.relative_to(root)}: {item.format}{several}")
     if others:
         lines.append("left out:")
