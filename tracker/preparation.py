@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import InputError
 from . import kernels
 from .pose import FloatArray
 from .session import Alignment
@@ -24,6 +25,8 @@ class Preparation:
         self._translation = np.array(alignment.translation_mm, dtype=np.float64)
         self._midsagittal = alignment.midsagittal
         self.coils: FloatArray = np.full((len(self._picked), 3), np.nan)
+        # Frames are copied here first: a read-only or strided array would be another type for the compiler.
+        self._raw = np.zeros((self.channels_needed, 3))
 
     @property
     def channels_needed(self) -> int:
@@ -32,8 +35,14 @@ class Preparation:
 
     def frame(self, raw: FloatArray) -> FloatArray:
         """Fills and returns `self.coils` (n, 3) from raw (all coils, 3); NaN = missing in both."""
+        if len(raw) < len(self._raw):
+            raise InputError(
+                f"a frame has {len(raw)} coils, but channel {len(self._raw)} is to be tracked; check what the "
+                "source sends."
+            )
+        self._raw[:] = raw[: len(self._raw)]
         kernels.prepare_frame(
-            raw, self._picked, self._rotation, self._translation, self._midsagittal, self.coils
+            self._raw, self._picked, self._rotation, self._translation, self._midsagittal, self.coils
         )
         return self.coils
 

@@ -1,0 +1,213 @@
+"""The OSC addresses as data: the encoder, the monitor's checks and the documentation are made from it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+
+PROTOCOL_NAME = "tonguetrack"
+PROTOCOL_VERSION = 1
+MAX_DATAGRAM_BYTES = 1400
+INFO_PERIOD_S = 1.0
+NO_RESIDUAL = -1.0
+SPEAKER_FIXED, SPEAKER_FREE = "fixed", "free"
+
+_VALUE_TYPES: dict[str, tuple[type, ...]] = {"i": (int,), "f": (float,), "s": (str,)}
+
+
+@dataclass(frozen=True)
+class Argument:
+    """tag: OSC type, "i", "f" or "s"; count: "" for one, else the letter for how many (K, m or n)."""
+
+    name: str
+    tag: str
+    unit: str = ""
+    count: str = ""
+
+    def __str__(self) -> str:
+        unit = f" ({self.unit})" if self.unit else ""
+        return f"{self.count} x {self.name}{unit}" if self.count else f"{self.name}{unit}"
+
+
+@dataclass(frozen=True)
+class Address:
+    """One row of the table. A `<k>` in the path stands for the index of a coefficient, from 0."""
+
+    path: str
+    arguments: tuple[Argument, ...]
+    when: str
+    meaning: str
+
+    @property
+    def type_tags(self) -> str:
+        """As OSC writes them, with * and a letter where an argument repeats: ",f*K"."""
+        repeated = (f"{a.tag}*{a.count}" if a.count else a.tag for a in self.arguments)
+        return "," + "".join(repeated)
+
+    @cached_property
+    def _pattern(self) -> re.Pattern[str]:
+        return re.compile(re.escape(self.path).replace(re.escape("<k>"), "[0-9]{1,4}"))
+
+    def matches(self, path: str) -> bool:
+        return self._pattern.fullmatch(path) is not None
+
+    def fits(self, values: list[object]) -> bool:
+        """Whether decoded arguments have the types and the number that the row states."""
+        if self.arguments and self.arguments[-1].count:
+            single, repeated = self.arguments[:-1], self.arguments[-1]
+        else:
+            single, repeated = self.arguments, None
+        if len(values) < len(single) or (repeated is None and len(values) > len(single)):
+            return False
+        expected = [argument.tag for argument in single]
+        if repeated is not None:
+            expected += [repeated.tag] * (len(values) - len(single))
+        return all(type(v) in _VALUE_TYPES[tag] for v, tag in zip(values, expected, strict=True))
+
+
+FRAME = Address(
+    "/tongue/frame",
+    (Argument("sequence number", "i"), Argument("time", "f", "s"), Argument("status", "i")),
+    "every frame",
+    "The sequence number counts this stream's frames from 0, so a gap is a lost datagram. The time is the "
+    "device's, since the stream's first frame. Status: see below.",
+)
+POSE = Address(
+    "/tongue/pose",
+    (Argument("weight", "f", "raw", "K"),),
+    "every frame",
+    "The coefficients of the pose, as the model multiplies them.",
+)
+SIGMA = Address(
+    "/tongue/sigma",
+    (Argument("weight", "f", "sigma", "K"),),
+    "every frame",
+    "The same in standard deviations from the mean: (weight - mean) / spread. Mostly within -3 and 3.",
+)
+POSE_SCALAR = Address(
+    "/tongue/pose/<k>",
+    (Argument("weight", "f", "raw"),),
+    "every frame, where it fits",
+    "Coefficient k alone, for receivers that map one address to one property.",
+)
+SIGMA_SCALAR = Address(
+    "/tongue/sigma/<k>",
+    (Argument("weight", "f", "sigma"),),
+    "every frame, where it fits",
+    "The same in standard deviations.",
+)
+QUALITY = Address(
+    "/tongue/quality",
+    (Argument("residual", "f", "mm"), Argument("valid coils", "i"), Argument("latency", "f", "ms")),
+    "every frame",
+    "Mean distance of the coils from their vertices, -1 when no coil was there; how many coils were there; "
+    "time on the sending host from the frame's arrival until its bundle was written.",
+)
+INFO = Address(
+    "/tongue/info",
+    (
+        Argument("protocol", "s"),
+        Argument("protocol version", "i"),
+        Argument("model name", "s"),
+        Argument("model fingerprint", "s"),
+        Argument("vertices", "i"),
+        Argument("K", "i"),
+        Argument("speaker", "s", "fixed or free"),
+        Argument("rate", "f", "Hz"),
+    ),
+    "start, every second",
+    "What is streamed. A model that was not made from real tongues has the word synthetic in its name.",
+)
+COILS = Address(
+    "/tongue/coils",
+    (Argument("role", "s", count="n"),),
+    "start, every second",
+    "The roles of the coils that are tracked.",
+)
+SPEAKER = Address(
+    "/tongue/speaker",
+    (Argument("weight", "f", "raw", "m"),),
+    "start, every second",
+    "The speaker's weights; while the speaker is free, those of the latest frame.",
+)
+MEAN = Address(
+    "/tongue/mean",
+    (Argument("weight", "f", "raw", "K"),),
+    "start, every second",
+    "The mean of each coefficient.",
+)
+SPREAD = Address(
+    "/tongue/spread",
+    (Argument("weight", "f", "raw", "K"),),
+    "start, every second",
+    "The standard deviation of each coefficient.",
+)
+
+FRAME_ADDRESSES = (FRAME, POSE, SIGMA, POSE_SCALAR, SIGMA_SCALAR, QUALITY)
+INFO_ADDRESSES = (INFO, COILS, SPEAKER, MEAN, SPREAD)
+ADDRESSES = FRAME_ADDRESSES + INFO_ADDRESSES
+
+
+def find_address(path: str) -> Address | None:
+    """The row that a received path belongs to, None for a path of someone else's."""
+    return next((address for address in ADDRESSES if address.matches(path)), None)
+
+
+def address_table() -> str:
+    """The table in Markdown."""
+    lines = ["| address | types | arguments | sent | meaning |", "|---|---|---|---|---|"]
+    for row in ADDRESSES:
+        arguments = ", ".join(map(str, row.arguments))
+        lines.append(f"| `{row.path}` | `{row.type_tags}` | {arguments} | {row.when} | {row.meaning} |")
+    return "\n".join(lines)
+
+
+def protocol_page() -> str:
+    """The whole of docs/osc.md."""
+    return f"""# The OSC stream
+
+This page is made by `tonguetrack monitor --addresses > docs/osc.md`; change it in
+`tracker/streams/addresses.py`.
+
+`tonguetrack demo` and `tonguetrack track --osc HOST:PORT` send OSC 1.0 over UDP, by default to 127.0.0.1:9000.
+Every frame is one bundle, every bundle one datagram of at most {MAX_DATAGRAM_BYTES} bytes. All time tags are
+"immediately"; when a frame was captured is an argument. Nothing is expected back: a receiver that is absent,
+late or slow changes nothing for the sender.
+
+The stream carries coefficients, not a mesh. With the model that `/tongue/info` names, a tongue is
+
+    vertices = base + pose[0] * direction[0] + ... + pose[K-1] * direction[K-1]
+
+and in Python `load_model(path).for_speaker(speaker).vertices(pose)`, in mm. K is whatever the model has: take it
+from the number of arguments. Ignore addresses that you do not know, and arguments beyond those listed; later
+versions may add both. `tonguetrack monitor` shows what arrives, and names what it does not know.
+
+{address_table()}
+
+K: coefficients of the pose; m: weights of the speaker (without any, `/tongue/speaker` is left out);
+n: coils. `<k>` counts from 0. The one-value addresses are left out when a frame would not fit otherwise
+(K above about 20).
+
+| status | meaning |
+|---|---|
+| 0 | lost: no coil has arrived yet; the pose is the model's mean |
+| 1 | ok |
+| 2 | held: no coil in this frame; the pose is the previous one |
+| 3 | relaxing: no coil for longer; the pose drifts back to the mean |
+
+No argument is ever NaN or infinite. The time is a 32-bit float: exact to 0.25 ms within the first hour, to
+4 ms within the first day; the sequence number is exact and begins again at 0 after 2^31 frames.
+A sequence number of 0 is the start of a stream.
+
+A receiver in Python, with python-osc:
+
+```python
+from pythonosc.dispatcher import Dispatcher
+from pythonosc.osc_server import BlockingOSCUDPServer
+
+dispatcher = Dispatcher()
+dispatcher.map("/tongue/pose", lambda address, *weights: print(weights))
+BlockingOSCUDPServer(("127.0.0.1", 9000), dispatcher).serve_forever()
+```
+"""

@@ -1,0 +1,255 @@
+"""Poses as OSC datagrams: bundles made once with python-osc, numbers written over per frame, one send."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import time
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+from pythonosc.osc_message_builder import OscMessageBuilder
+
+from ... import InputError
+from ..pose import FloatArray, TrackedPose
+from .addresses import (
+    COILS,
+    FRAME,
+    INFO,
+    INFO_PERIOD_S,
+    MAX_DATAGRAM_BYTES,
+    MEAN,
+    NO_RESIDUAL,
+    POSE,
+    POSE_SCALAR,
+    PROTOCOL_NAME,
+    PROTOCOL_VERSION,
+    QUALITY,
+    SIGMA,
+    SIGMA_SCALAR,
+    SPEAKER,
+    SPEAKER_FIXED,
+    SPEAKER_FREE,
+    SPREAD,
+    Address,
+)
+from .sink import StreamInfo
+
+DEFAULT_DESTINATION = "127.0.0.1:9000"
+MAX_NAME_LENGTH = 120
+_BUNDLE_HEADER_BYTES = 16
+_ELEMENT_HEADER_BYTES = 4
+_SEQUENCE_MASK = 0x7FFF_FFFF
+
+
+class FrameBundle:
+    """The datagram of one frame, for K coefficients; `write` replaces its numbers in place.
+
+    datagram: the bytes to send. has_scalars: whether the one-value addresses are in it.
+    """
+
+    def __init__(self, size: int) -> None:
+        zeros = [0.0] * size
+        head = [(FRAME.path, FRAME, [0, 0.0, 0]), (POSE.path, POSE, zeros), (SIGMA.path, SIGMA, zeros)]
+        scalars = [
+            (row.path.replace("<k>", str(k)), row, [0.0])
+            for row in (POSE_SCALAR, SIGMA_SCALAR)
+            for k in range(size)
+        ]
+        tail = [(QUALITY.path, QUALITY, [0.0, 0, 0.0])]
+        messages = [_message(row, values, path) for path, row, values in head + scalars + tail]
+        self.has_scalars = _bundle_bytes(messages) <= MAX_DATAGRAM_BYTES
+        if not self.has_scalars:
+            messages = [_message(row, values, path) for path, row, values in head + tail]
+        if _bundle_bytes(messages) > MAX_DATAGRAM_BYTES:
+            raise InputError(
+                f"{size} coefficients need {_bundle_bytes(messages)} bytes a frame, but an OSC datagram here has "
+                f"at most {MAX_DATAGRAM_BYTES}; use a model with fewer pose modes."
+            )
+        self.datagram = bytearray(_bundle(messages))
+        # All arguments are 4 bytes and stand at the end of their message.
+        ends = (
+            np.cumsum([_ELEMENT_HEADER_BYTES + len(message) for message in messages]) + _BUNDLE_HEADER_BYTES
+        )
+        self._frame_at = int(ends[0]) - 4 * 3
+        self._quality_at = int(ends[-1]) - 4 * 3
+        self._words = np.frombuffer(self.datagram, dtype=">f4")
+        vector = np.arange(size)
+        pose_words, sigma_words = [int(ends[1]) // 4 - size + vector], [int(ends[2]) // 4 - size + vector]
+        if self.has_scalars:
+            pose_words.append(ends[3 : 3 + size] // 4 - 1)
+            sigma_words.append(ends[3 + size : 3 + 2 * size] // 4 - 1)
+        self._pose_words = np.stack(pose_words)  # (1 or 2, K) places of each coefficient, in 4-byte words
+        self._sigma_words = np.stack(sigma_words)
+        self._write_frame = struct.Struct(">ifi").pack_into
+        self._write_quality = struct.Struct(">fif").pack_into
+
+    def write(self, pose: TrackedPose, sequence: int, time_s: float, latency_ms: float) -> None:
+        """sequence: wraps to 0 after 2^31 - 1; time_s: since the stream's start."""
+        self._write_frame(self.datagram, self._frame_at, sequence & _SEQUENCE_MASK, time_s, pose.status)
+        self._words[self._pose_words] = pose.weights
+        self._words[self._sigma_words] = pose.normalised
+        residual = pose.residual_mm if pose.valid_coils else NO_RESIDUAL
+        self._write_quality(self.datagram, self._quality_at, residual, pose.valid_coils, latency_ms)
+
+
+def info_datagrams(info: StreamInfo) -> list[bytes]:
+    """What is sent at the start and every second: bundles of at most MAX_DATAGRAM_BYTES, mostly one."""
+    about = [
+        PROTOCOL_NAME,
+        PROTOCOL_VERSION,
+        _osc_text(info.model_name),
+        _osc_text(info.model_fingerprint),
+        info.vertex_count,
+        len(info.mean),
+        SPEAKER_FIXED if info.speaker_fixed else SPEAKER_FREE,
+        info.rate_hz,
+    ]
+    messages = [
+        _message(INFO, about),
+        _message(COILS, [_osc_text(role) for role in info.roles]),
+        _message(MEAN, info.mean.tolist()),
+        _message(SPREAD, info.sigma.tolist()),
+    ]
+    if len(info.speaker_weights):
+        messages.insert(0, _message(SPEAKER, info.speaker_weights.tolist()))
+    groups: list[list[bytes]] = [[]]
+    for message in messages:
+        if _bundle_bytes([message]) > MAX_DATAGRAM_BYTES:
+            path = message.split(b"\0", 1)[0].decode()
+            raise InputError(
+                f"the message {path} needs {len(message)} bytes, more than an OSC datagram of "
+                f"{MAX_DATAGRAM_BYTES} holds; use a model or session with fewer entries."
+            )
+        if _bundle_bytes([*groups[-1], message]) > MAX_DATAGRAM_BYTES:
+            groups.append([])
+        groups[-1].append(message)
+    return [_bundle(group) for group in groups]
+
+
+class OscSink:
+    """Sends every pose to one UDP destination, without ever waiting for it.
+
+    The socket is not connected and does not block: whatever the network answers, a frame is either handed
+    to the operating system or counted in `dropped`. The destination's name is looked up once, here.
+    """
+
+    def __init__(self, destination: str = DEFAULT_DESTINATION) -> None:
+        self.destination = f"osc {destination}"
+        self.sent = 0
+        self.dropped = 0
+        family, self._peer = resolve(destination)
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        if family == socket.AF_INET:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self._bundle: FrameBundle | None = None
+        self._info: list[bytearray] = []
+        self._speaker_words: FloatArray | None = None
+        self._sequence = 0
+        self._start_s: float | None = None
+        self._next_info_ns = 0
+
+    def start(self, info: StreamInfo) -> None:
+        """Builds the datagrams and sends the info for the first time."""
+        self._bundle = FrameBundle(len(info.mean))
+        self._info = [bytearray(datagram) for datagram in info_datagrams(info)]
+        count = len(info.speaker_weights)
+        if count and not info.speaker_fixed:
+            # The speaker's message is the first: its weights end where its element ends.
+            element = int.from_bytes(self._info[0][_BUNDLE_HEADER_BYTES:][:_ELEMENT_HEADER_BYTES], "big")
+            end = _BUNDLE_HEADER_BYTES + _ELEMENT_HEADER_BYTES + element
+            self._speaker_words = np.frombuffer(self._info[0], ">f4")[end // 4 - count : end // 4]
+        self._sequence = 0
+        self._start_s = None
+        self._send_info()
+
+    def send(self, pose: TrackedPose) -> None:
+        """Writes and sends one frame; afterwards the info, when a second has passed."""
+        bundle = self._bundle
+        assert bundle is not None, "start() comes before send()"
+        if self._start_s is None:
+            self._start_s = pose.device_time_s
+        now_ns = time.perf_counter_ns()
+        bundle.write(
+            pose, self._sequence, pose.device_time_s - self._start_s, (now_ns - pose.arrival_ns) * 1e-6
+        )
+        self._sequence += 1
+        try:
+            self._socket.sendto(bundle.datagram, self._peer)
+            self.sent += 1
+        except OSError:  # buffer full, nobody there, network gone: the next frame is newer anyway
+            self.dropped += 1
+        if now_ns >= self._next_info_ns:
+            if self._speaker_words is not None:
+                self._speaker_words[:] = pose.speaker_weights
+            self._send_info()
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def _send_info(self) -> None:
+        self._next_info_ns = time.perf_counter_ns() + int(INFO_PERIOD_S * 1e9)
+        for datagram in self._info:
+            try:
+                self._socket.sendto(datagram, self._peer)
+            except OSError:  # it is sent again in a second
+                pass
+
+
+def parse_host_port(text: str) -> tuple[str, int]:
+    """ "127.0.0.1:9000", "name:9000" or "[::1]:9000" as host and port."""
+    host, colon, port = text.strip().rpartition(":")
+    if host.startswith("[") and host.endswith("]"):
+        host = host[1:-1]
+    elif ":" in host:
+        raise InputError(f"'{text}': an IPv6 address stands in brackets, as in [::1]:9000.")
+    if not colon or not host or any(c.isspace() or c in "/[]" for c in host):
+        raise InputError(f"'{text}': expected HOST:PORT, as in {DEFAULT_DESTINATION}.")
+    if not (port.isascii() and port.isdigit() and 1 <= int(port) <= 65535):
+        raise InputError(f"'{text}': the port '{port}' should be a number from 1 to 65535.")
+    return host, int(port)
+
+
+def resolve(text: str) -> tuple[socket.AddressFamily, tuple[object, ...]]:
+    """HOST:PORT as the address family and the numeric address that sockets take; IPv4 where there is a choice,
+    because that is where receivers listen when someone says localhost."""
+    host, port = parse_host_port(text)
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+    except (OSError, UnicodeError) as reason:
+        raise InputError(f"'{text}': the host '{host}' is not known here; check its name.") from reason
+    family, _, _, _, address = min(found, key=lambda entry: entry[0] != socket.AF_INET)
+    return family, address
+
+
+def _message(row: Address, values: Iterable[object], path: str = "") -> bytes:
+    """One OSC message for a row of the table; `path` where the row's holds a <k>."""
+    builder = OscMessageBuilder(path or row.path)
+    values = list(values)
+    tags = [argument.tag for argument in row.arguments]
+    if row.arguments[-1].count:
+        tags += tags[-1:] * (len(values) - len(tags))
+    for value, tag in zip(values, tags, strict=True):
+        builder.add_arg(value, tag)
+    return bytes(builder.build().dgram)
+
+
+def _bundle_bytes(messages: Sequence[bytes]) -> int:
+    return _BUNDLE_HEADER_BYTES + sum(_ELEMENT_HEADER_BYTES + len(message) for message in messages)
+
+
+def _bundle(messages: Sequence[bytes]) -> bytes:
+    from pythonosc.osc_message import OscMessage
+
+    builder = OscBundleBuilder(IMMEDIATELY)
+    for message in messages:
+        builder.add_content(OscMessage(message))
+    return bytes(builder.build().dgram)
+
+
+def _osc_text(text: str) -> str:
+    """OSC strings are ASCII without zeros; names of people's files are cut to what a datagram bears."""
+    plain = text.encode("ascii", "replace").decode().replace("\0", "?")
+    return plain if len(plain) <= MAX_NAME_LENGTH else plain[: MAX_NAME_LENGTH - 3] + "..."
