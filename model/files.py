@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import InputError
+from ..archive import read_arrays
 from ..atomic import write_atomically
 from .mesh import FloatArray
 from .multilinear import Mode, SurfaceMarks, TongueModel
@@ -54,7 +54,7 @@ def load_model(path: str | Path) -> TongueModel:
     except InputError as reason:
         message = str(reason)
         raise InputError(message if message.startswith(str(path)) else f"{path}: {message}") from reason
-    except (ValueError, KeyError, TypeError, OSError, EOFError, RecursionError, zipfile.BadZipFile) as reason:
+    except Exception as reason:  # whatever a damaged file makes the parsers and the checks stumble over
         raise InputError(
             f"{path}: this is not a readable tongue model ({type(reason).__name__}: {_short(reason)})."
         ) from reason
@@ -123,52 +123,46 @@ def _npz_bytes(model: TongueModel) -> bytes:
 
 
 def _model_from_npz(data: bytes) -> TongueModel:
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        unpacked = sum(entry.file_size for entry in archive.infolist())
-    if unpacked > MAX_MODEL_BYTES:
-        raise InputError(f"it would unpack to {unpacked} bytes, which is too much for a model.")
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        if "header" not in arrays:
-            raise InputError(
-                "this .npz is not a tongue model (it has no 'header'); make one with 'model build'."
-            )
-        header = json.loads(arrays["header"].tobytes().decode())
-        if header.get("format") != FORMAT_NAME:
-            raise InputError(f"this .npz holds '{header.get('format')}', not a '{FORMAT_NAME}'.")
-        if header.get("version") != FORMAT_VERSION:
-            raise InputError(
-                f"the model file has version {header.get('version')}; this tonguetrack reads version "
-                f"{FORMAT_VERSION}."
-            )
-
-        def numbers(name: str, dimensions: int) -> FloatArray:
-            array = arrays[name]
-            if array.ndim != dimensions or array.dtype.kind not in "fiu":
-                raise InputError(f"'{name}' should be a {dimensions}-dimensional array of numbers.")
-            return np.asarray(array, dtype=np.float64)
-
-        def optional(name: str, dimensions: int) -> FloatArray | None:
-            return numbers(name, dimensions) if name in arrays else None
-
-        def mode(name: str) -> Mode:
-            return Mode(
-                numbers(f"{name}_mean", 1),
-                int(header[name]["entries"]),
-                optional(f"{name}_training", 2),
-                optional(f"{name}_spectrum", 1),
-                tuple(map(str, header[name]["names"])),
-            )
-
-        marks = SurfaceMarks(
-            {str(k): int(v) for k, v in header["landmarks"].items()},
-            {str(k): tuple(map(int, v)) for k, v in header["regions"].items()},
-            tuple(map(int, header["midsagittal"])),
+    arrays = read_arrays(data, MAX_MODEL_BYTES)
+    if "header" not in arrays:
+        raise InputError("this .npz is not a tongue model (it has no 'header'); make one with 'model build'.")
+    header = json.loads(arrays["header"].tobytes().decode())
+    if header.get("format") != FORMAT_NAME:
+        raise InputError(f"this .npz holds '{header.get('format')}', not a '{FORMAT_NAME}'.")
+    if header.get("version") != FORMAT_VERSION:
+        raise InputError(
+            f"the model file has version {header.get('version')}; this tonguetrack reads version "
+            f"{FORMAT_VERSION}."
         )
-        provenance = {str(k): str(v) for k, v in header["provenance"].items()}
-        faces = numbers("faces", 2)
-        model = TongueModel(
-            numbers("core", 3), numbers("origin", 1), faces, mode("speaker"), mode("pose"), marks, provenance
+
+    def numbers(name: str, dimensions: int) -> FloatArray:
+        array = arrays[name]
+        if array.ndim != dimensions or array.dtype.kind not in "fiu":
+            raise InputError(f"'{name}' should be a {dimensions}-dimensional array of numbers.")
+        return np.asarray(array, dtype=np.float64)
+
+    def optional(name: str, dimensions: int) -> FloatArray | None:
+        return numbers(name, dimensions) if name in arrays else None
+
+    def mode(name: str) -> Mode:
+        return Mode(
+            numbers(f"{name}_mean", 1),
+            int(header[name]["entries"]),
+            optional(f"{name}_training", 2),
+            optional(f"{name}_spectrum", 1),
+            tuple(map(str, header[name]["names"])),
         )
+
+    marks = SurfaceMarks(
+        {str(k): int(v) for k, v in header["landmarks"].items()},
+        {str(k): tuple(map(int, v)) for k, v in header["regions"].items()},
+        tuple(map(int, header["midsagittal"])),
+    )
+    provenance = {str(k): str(v) for k, v in header["provenance"].items()}
+    faces = numbers("faces", 2)
+    model = TongueModel(
+        numbers("core", 3), numbers("origin", 1), faces, mode("speaker"), mode("pose"), marks, provenance
+    )
     return _checked(model)
 
 

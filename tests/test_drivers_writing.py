@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from tonguetrack.drivers import FrameOfReference, Recording, open_recording, write_recording
-from tonguetrack.drivers.atomic import write_atomically
+from tonguetrack.atomic import write_atomically
 from tonguetrack.drivers.files.authors import authors_bytes
 from tonguetrack.drivers.files.npz import npz_bytes
 from tonguetrack.drivers.files.recognise import parse

@@ -35,8 +35,11 @@ from numba import njit
 RELATIVE_DECREASE = 1e-12
 MAX_NEWTON_STEPS = 100
 MAX_ACTIVE_SET_STEPS = 200
+# Gauss-Newton is cheap far from the minimum, but only linear near it where residuals are large.
+GAUSS_NEWTON_STEPS = 6
 
 STATUS_LOST, STATUS_OK, STATUS_HELD = 0, 1, 2
+INDEFINITE, SOLVED = 0, 1
 
 
 def quadratic_scratch(size: int) -> np.ndarray:
@@ -57,11 +60,14 @@ def free_scratch(speaker_size: int, pose_size: int, coils: int) -> tuple[np.ndar
 
 @njit(cache=True, inline="never")
 def minimise_quadratic_in_box(hessian, linear, low, high, x, scratch):
-    """Minimises 1/2 x'Hx - linear'x over the box, from x, in place; True when H was positive definite
-    on every face of the box that was visited (only then is x the minimiser).
+    """Minimises 1/2 x'Hx - linear'x over the box, from x, in place.
 
-    Primal active set: Newton step on the free coordinates up to the first bound in the way, which is
-    then held; at a face's minimum the held bound that pulls inwards most is let go.
+    Returns SOLVED when x is the minimiser; INDEFINITE when H is not positive definite on a face of the
+    box that had to be minimised: x is then the best point reached, possibly the start.
+
+    Primal active set: a Newton step on the free coordinates up to the first bound in the way, which is
+    then held; at a face's minimum the held bound that pulls inwards most is let go. Bounds that hold
+    already at the start stay held, so that H need only be positive definite where x can move.
     """
     size = x.shape[0]
     factor = scratch[:size]
@@ -74,13 +80,19 @@ def minimise_quadratic_in_box(hessian, linear, low, high, x, scratch):
             x[i] = low[i]
         elif x[i] > high[i]:
             x[i] = high[i]
-        held[i] = 0.0
-    for _ in range(MAX_ACTIVE_SET_STEPS):
+    for visit in range(MAX_ACTIVE_SET_STEPS):
         for i in range(size):
             total = -linear[i]
             for j in range(size):
                 total += hessian[i, j] * x[j]
             gradient[i] = total
+        if visit == 0:
+            for i in range(size):
+                held[i] = 0.0
+                if x[i] == low[i] and gradient[i] >= 0.0:
+                    held[i] = -1.0
+                elif x[i] == high[i] and gradient[i] <= 0.0:
+                    held[i] = 1.0
         free = 0
         for i in range(size):
             if held[i] == 0.0:
@@ -96,8 +108,8 @@ def minimise_quadratic_in_box(hessian, linear, low, high, x, scratch):
                     for c in range(b):
                         total -= factor[a, c] * factor[b, c]
                     if a == b:
-                        if total <= 1e-14 * abs(hessian[i, i]) or total <= 0.0:
-                            return False
+                        if total <= 1e-14 * abs(hessian[i, i]):
+                            return INDEFINITE
                         factor[a, a] = np.sqrt(total)
                     else:
                         factor[a, b] = total / factor[b, b]
@@ -127,11 +139,7 @@ def minimise_quadratic_in_box(hessian, linear, low, high, x, scratch):
                     blocking = a
             for a in range(free):
                 i = int(index[a])
-                x[i] += share * step[a]
-                if x[i] < low[i]:
-                    x[i] = low[i]
-                elif x[i] > high[i]:
-                    x[i] = high[i]
+                x[i] = min(max(x[i] + share * step[a], low[i]), high[i])
             if blocking >= 0:
                 i = int(index[blocking])
                 if step[blocking] > 0.0:
@@ -157,9 +165,9 @@ def minimise_quadratic_in_box(hessian, linear, low, high, x, scratch):
                     worst = pull
                     release = i
         if release < 0:
-            return True
+            return SOLVED
         held[release] = 0.0
-    return True
+    return SOLVED
 
 
 @njit(cache=True, inline="never")
@@ -242,7 +250,7 @@ def solve_fixed_speaker(
     for a in range(size):
         previous[a] = weights[a]
     ridge = 0.0
-    while not minimise_quadratic_in_box(
+    while SOLVED != minimise_quadratic_in_box(
         hessian, linear, box[1], box[2], weights, scratch[size + 1 : 2 * size + 5]
     ):
         # Without bias and coherence too few coils leave directions undetermined: the smallest ridge
@@ -378,15 +386,59 @@ def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scra
         if not np.isnan(coils[i, 0]):
             present += 1
     share = alpha / present
-    use_gauss_newton = True  # as the first resort when the exact Hessian is not positive definite
+    gauss_newton_steps = (
+        GAUSS_NEWTON_STEPS  # the first resort where the exact Hessian is not positive definite
+    )
     for _ in range(MAX_NEWTON_STEPS):
         energy = free_energy(
             coils, base, core, box, alpha, beta, gamma, previous, weights, jacobian, residual
         )
         shift = 0.0
         exact = True
+        stationary_if_small = True
+        free_gradient_and_hessian(
+            coils,
+            core,
+            box,
+            alpha,
+            beta,
+            gamma,
+            previous,
+            weights,
+            jacobian,
+            residual,
+            exact,
+            gradient,
+            hessian,
+        )
         while True:
-            if shift == 0.0:
+            for a in range(size):
+                total = -gradient[a]
+                for b in range(size):
+                    shifted[a, b] = hessian[a, b]
+                shifted[a, a] += shift
+                for b in range(size):
+                    total += shifted[a, b] * weights[b]
+                linear[a] = total
+                target[a] = weights[a]
+            outcome = minimise_quadratic_in_box(shifted, linear, box[1], box[2], target, quadratic)
+            slope = 0.0
+            curvature = 0.0
+            for a in range(size):
+                slope += gradient[a] * (target[a] - weights[a])
+                for b in range(size):
+                    curvature += (target[a] - weights[a]) * shifted[a, b] * (target[b] - weights[b])
+            promised = -(slope + 0.5 * curvature)
+            if outcome == SOLVED and slope <= 0.0:
+                stationary_if_small = True
+                break
+            # The minimum of a smaller face is a step too, if it leads down noticeably.
+            if slope < 0.0 and promised > 1e-6 * energy:
+                stationary_if_small = False
+                break
+            if gauss_newton_steps > 0 and exact:
+                exact = False
+                gauss_newton_steps -= 1
                 free_gradient_and_hessian(
                     coils,
                     core,
@@ -402,29 +454,9 @@ def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scra
                     gradient,
                     hessian,
                 )
-            for a in range(size):
-                total = -gradient[a]
-                for b in range(size):
-                    shifted[a, b] = hessian[a, b]
-                shifted[a, a] += shift
-                for b in range(size):
-                    total += shifted[a, b] * weights[b]
-                linear[a] = total
-                target[a] = weights[a]
-            convex = minimise_quadratic_in_box(shifted, linear, box[1], box[2], target, quadratic)
-            slope = 0.0
-            curvature = 0.0
-            for a in range(size):
-                slope += gradient[a] * (target[a] - weights[a])
-                for b in range(size):
-                    curvature += (target[a] - weights[a]) * shifted[a, b] * (target[b] - weights[b])
-            if convex and slope <= 0.0:
-                break
-            if exact and use_gauss_newton and shift == 0.0:
-                exact = False
                 continue
-            exact = True if shift == 0.0 and not exact else exact
             if shift == 0.0:
+                exact = True
                 free_gradient_and_hessian(
                     coils,
                     core,
@@ -436,19 +468,17 @@ def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scra
                     weights,
                     jacobian,
                     residual,
-                    True,
+                    exact,
                     gradient,
                     hessian,
                 )
-                trace = 0.0
                 for a in range(size):
-                    trace += abs(hessian[a, a])
-                shift = 1e-3 * trace / size + 1e-12
+                    shift += abs(hessian[a, a])
+                shift = 1e-3 * shift / size + 1e-12
             else:
                 shift *= 8.0
             if shift > 1e30:
                 return energy
-        promised = -(slope + 0.5 * curvature)
         # E(t) along the step: the residual is residual + t first + t^2 second, exactly.
         for row in range(rows):
             first_order[row] = 0.0
@@ -495,12 +525,13 @@ def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scra
         if change > 0.0:
             return energy
         for a in range(size):
-            weights[a] += length * (target[a] - weights[a])
-        if promised <= RELATIVE_DECREASE * energy + 1e-24:
+            moved = target[a] if length == 1.0 else weights[a] + length * (target[a] - weights[a])
+            weights[a] = min(max(moved, box[1, a]), box[2, a])
+        if stationary_if_small and promised <= RELATIVE_DECREASE * energy + 1e-24:
             return energy + change
         if not exact and -change < 0.25 * promised:
-            use_gauss_newton = False
-    return energy
+            gauss_newton_steps = 0
+    return free_energy(coils, base, core, box, alpha, beta, gamma, previous, weights, jacobian, residual)
 
 
 @njit(cache=True, inline="never")

@@ -138,10 +138,11 @@ def _frame_hints(recording: Recording, session: Session) -> list[str]:
         )
     if np.array_equal(axis_mapping(axes), np.eye(3)):
         return []
-    return [
+    hint = (
         f"note: the file's frame is {recording.frame}, the model's is {MODEL_FRAME}; "
         f"unless the file was rotated already, [alignment] needs axes = {json.dumps(axes)}"
-    ]
+    )
+    return [hint]
 
 
 def suggested_axes(frame: FrameOfReference) -> tuple[str, str, str] | None:

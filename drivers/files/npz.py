@@ -1,23 +1,22 @@
-"""Our .npz of a recording: every array as it is, no pickle, every length checked before it is read."""
+"""Our .npz of a recording: every array as it is, no pickle, every length checked before it is used."""
 
 from __future__ import annotations
 
 import io
 import json
-import math
-import zipfile
 from typing import Any
 
 import numpy as np
 
 from ... import InputError
+from ...archive import read_arrays
 from ..frames import Recording
 from .common import Options, check_rate
 from .tabular import frame_from_text
 
 VERSION = 1
 MARK = "tonguetrack_recording"
-LARGEST_RATIO = 1100
+MAX_BYTES = 4 * 1024**3
 
 
 def is_npz(head: bytes) -> bool:
@@ -46,7 +45,10 @@ def npz_bytes(recording: Recording) -> bytes:
 
 def parse_npz(data: bytes, name: str, options: Options) -> Recording:
     """A recording written by `npz_bytes`."""
-    arrays = _arrays(data, name)
+    try:
+        arrays = read_arrays(data, MAX_BYTES)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
     if MARK not in arrays:
         raise InputError(
             f"{name}: this .npz holds {', '.join(list(arrays)[:6]) or 'nothing'} and is not a recording; if it is a "
@@ -76,46 +78,3 @@ def parse_npz(data: bytes, name: str, options: Options) -> Recording:
         raise InputError(
             f"{name}: the recording's description is damaged ({error}); write it again."
         ) from error
-
-
-def _arrays(data: bytes, name: str) -> dict[str, np.ndarray[Any, Any]]:
-    """Member name -> array; shape, type and size of each agree before anything is allocated."""
-    arrays: dict[str, np.ndarray[Any, Any]] = {}
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            for member in archive.infolist():
-                key = member.filename.removesuffix(".npy")
-                if member.file_size > LARGEST_RATIO * max(member.compress_size, 1) or (
-                    member.compress_size > len(data)
-                ):
-                    raise InputError(
-                        f"{name}: the member {key!r} claims an impossible size; the file is damaged."
-                    )
-                if key == member.filename or len(arrays) >= 64:
-                    continue
-                if MARK + ".npy" not in archive.namelist():
-                    arrays[key] = np.empty(0)
-                    continue
-                arrays[key] = _array(archive.read(member), key, name)
-    except InputError:
-        raise
-    except Exception as error:  # zipfile and the .npy header raise a dozen kinds on damaged bytes
-        raise InputError(f"{name}: the .npz archive is damaged or cut short; copy it again.") from error
-    return arrays
-
-
-def _array(content: bytes, key: str, name: str) -> np.ndarray[Any, Any]:
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    read_header = (
-        np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    )
-    shape, fortran, dtype = read_header(stream)
-    size = math.prod(shape) * dtype.itemsize
-    if dtype.kind not in "fiu" or size != len(content) - stream.tell():
-        raise InputError(f"{name}: the array {key!r} is not of plain numbers of its stated size.")
-    return (
-        np.frombuffer(content, dtype, offset=stream.tell())
-        .reshape(shape, order="F" if fortran else "C")
-        .copy()
-    )

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from ... import InputError
-from ..atomic import write_atomically
+from ...atomic import write_atomically
 from ..frames import Recording
 from .authors import authors_bytes
 from .npz import npz_bytes
