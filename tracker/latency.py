@@ -6,8 +6,7 @@ from array import array
 from math import exp, log
 
 import numpy as np
-
-from .pose import FloatArray
+from numpy.typing import NDArray
 
 BIN_RATIO = 1.02
 """Each bin is 2 % wider than the one below it; a percentile is therefore right to 1 %."""
@@ -19,8 +18,6 @@ class LogHistogram:
     Values outside go to the first or the last bin; `count`, `total`, `smallest` and `largest` are exact.
     One thread adds; another may read at the same time and sees counts that are at most one value apart.
     """
-
-    __slots__ = ("low", "high", "count", "total", "smallest", "largest", "_bins", "_scale", "_last")
 
     def __init__(self, low: float, high: float) -> None:
         self.low = low
@@ -41,10 +38,8 @@ class LogHistogram:
             self._bins[self._last] += 1
         else:
             self._bins[int(log(value / self.low) * self._scale)] += 1
-        if value > self.largest:
-            self.largest = value
-        if value < self.smallest:
-            self.smallest = value
+        self.largest = max(self.largest, value)
+        self.smallest = min(self.smallest, value)
         self.total += value
         self.count += 1
 
@@ -77,7 +72,7 @@ class LogHistogram:
         """None without values."""
         return float(self.largest) if self.count else None
 
-    def counts(self) -> FloatArray:
+    def counts(self) -> NDArray[np.int64]:
         """(bins,) int64, a copy."""
         return np.frombuffer(self._bins, np.int64).copy()
 

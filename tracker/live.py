@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -17,6 +17,7 @@ from ..model.multilinear import TongueModel
 from .latency import NS_PER_MS, NS_PER_US, latency_histogram, residual_histogram
 from .pose import PoseStatus, TrackedPose
 from .setup import Setup
+from .streams.osc import OscSink
 from .streams.sink import Sink, StreamInfo
 from .tracking import Tracker
 
@@ -39,12 +40,6 @@ class LiveStatus:
     missing_frames: how many frame numbers the source left out, in `gaps` places.
     coils_missing: (n,) frames in which each coil was absent; statuses: frames of each `PoseStatus`.
     """
-
-    __slots__ = (
-        "frames", "first_arrival_ns", "last_arrival_ns", "first_device_s", "last_device_s",
-        "statuses", "status", "valid_coils", "residual_mm", "gaps", "missing_frames",
-        "solve_ns", "arrival_to_sent_ns", "residuals", "coils_missing", "sinks", "_absent", "_last_number",
-    )  # fmt: skip
 
     def __init__(self, coils: int, sinks: Sequence[Sink] = ()) -> None:
         self.frames = 0
@@ -202,20 +197,26 @@ def stream_recording(
     destination: str,
     realtime: bool = True,
     seconds: float | None = None,
+    watch: Callable[[Source, LiveStatus], AbstractContextManager[object]] | None = None,
 ) -> Summary:
     """Tracks a recording frame by frame and sends the poses over OSC, at its own pace or as fast as possible.
 
-    destination: HOST:PORT. Raises InputError where it is not one.
+    destination: HOST:PORT; raises InputError where it is not one. seconds: of the recording's time, which
+    begins again where it is shorter; None plays it once. watch: entered around the run with its source
+    and its status, as `cli.watching.watched`, which shows a status line and ends the run at Ctrl-C.
     """
-    from .streams.osc import OscSink
-
     tracker = Tracker(model, setup)
-    with ReplaySource(recording, speed=1.0 if realtime else None) as source:
-        sink = OscSink(destination)
-        try:
-            return run_live(source, tracker, stream_info(model, setup, source.rate_hz), [sink], None, seconds)
-        finally:
-            sink.close()
+    source = ReplaySource(recording, speed=1.0 if realtime else None, loop=seconds is not None)
+    sink = OscSink(destination)
+    status = LiveStatus(len(setup.roles), [sink])
+    try:
+        with watch(source, status) if watch else nullcontext():
+            return run_live(
+                source, tracker, stream_info(model, setup, source.rate_hz), [sink], status, seconds
+            )
+    finally:
+        source.close()
+        sink.close()
 
 
 @contextmanager

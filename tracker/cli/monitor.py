@@ -1,0 +1,135 @@
+"""`tonguetrack monitor`: listens on a UDP port and says what arrives."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import TYPE_CHECKING
+
+from .demo import positive_seconds
+
+if TYPE_CHECKING:
+    import socket
+
+    from ..streams.monitor import Monitor
+
+RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
+REPORT_PERIOD_S = 1.0
+
+
+def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Register `monitor`."""
+    monitor = subparsers.add_parser(
+        "monitor",
+        help="listen for OSC and print what arrives: rates, gaps, unknown addresses",
+        description="Listens for OSC and prints what arrives. Ctrl-C ends it with the summary and exit code 0.",
+    )
+    monitor.add_argument(
+        "--listen", metavar="HOST:PORT", default="127.0.0.1:9000", help="where to listen (%(default)s)"
+    )
+    monitor.add_argument("--seconds", type=positive_seconds, metavar="N", help="stop after N seconds")
+    monitor.add_argument("--json", action="store_true", help="print the summary as JSON")
+    monitor.add_argument(
+        "--addresses", action="store_true", help="print what is sent where (docs/osc.md), and end"
+    )
+    monitor.set_defaults(run=run_monitor)
+
+
+def run_monitor(args: argparse.Namespace) -> int:
+    """Listen until stopped, then print the summary."""
+    if args.addresses:
+        from ..streams.addresses import protocol_page
+
+        print(protocol_page(), end="")
+        return 0
+    import logging
+
+    from ..streams.monitor import Monitor
+
+    logging.getLogger().addHandler(logging.NullHandler())  # python-osc logs what we count
+    receiver = listening_socket(args.listen)
+    monitor = Monitor(tell=_say)
+    _say(f"listening on {args.listen}; Ctrl-C ends")
+    try:
+        _listen(receiver, monitor, args.seconds)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        receiver.close()
+    print(json.dumps(monitor.as_dict(), indent=2, allow_nan=False) if args.json else monitor, flush=True)
+    return 0
+
+
+def listening_socket(address: str) -> socket.socket:
+    """A bound UDP socket. Raises InputError where the address is not this machine's or the port is taken."""
+    import errno
+    import socket
+
+    from ... import InputError
+    from ..streams.osc import resolve
+
+    family, place = resolve(address)
+    receiver = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        receiver.bind(place)
+    except OSError as reason:
+        receiver.close()
+        if reason.errno == errno.EADDRINUSE:
+            raise InputError(
+                f"{address}: the port is in use by another program; end that one or give another --listen."
+            ) from reason
+        raise InputError(
+            f"{address}: cannot listen there ({reason.strerror}); give another --listen."
+        ) from reason
+    return receiver
+
+
+def _listen(receiver: socket.socket, monitor: Monitor, seconds: float | None) -> None:
+    import time
+
+    from ..streams.monitor import MAX_BYTES
+
+    start = time.perf_counter()
+    end = start + (float("inf") if seconds is None else seconds)
+    report, frames = start + REPORT_PERIOD_S, 0
+    while (now := time.perf_counter()) < end:
+        if now >= report:
+            frames = _report(monitor, frames)
+            report += REPORT_PERIOD_S * (1 + int((now - report) / REPORT_PERIOD_S))
+        receiver.settimeout(max(1e-3, min(end, report) - now))
+        try:
+            # One byte more than is taken apart, so that a longer datagram shows itself.
+            datagram, sender = receiver.recvfrom(MAX_BYTES + 1)
+        except OSError:  # the time is over, or an earlier answer of ours could not be delivered
+            continue
+        monitor.receive(datagram, (sender[0], sender[1]), time.perf_counter_ns())
+
+
+def _report(monitor: Monitor, frames_before: int) -> int:
+    """One line a second while frames arrive. Returns the frames so far."""
+    from ..pose import PoseStatus
+
+    frames = sum(stream.frames for stream in monitor.streams.values())
+    newest, quality = monitor.seen.get("/tongue/frame"), monitor.seen.get("/tongue/quality")
+    sigma = monitor.seen.get("/tongue/sigma")
+    if frames == frames_before or not (newest and quality and sigma):
+        return frames
+    if newest.misfits or quality.misfits or sigma.misfits:
+        _say(f"{frames - frames_before} frames/s, with arguments that are not in the table")
+        return frames
+    lost = sum(stream.lost for stream in monitor.streams.values())
+    number, _, state = newest.last
+    residual, coils, latency = quality.last
+    names = {int(status): status.name.lower() for status in PoseStatus}
+    weights = " ".join(f"{weight:+.2f}" for weight in sigma.last[:8])
+    _say(
+        f"{frames - frames_before} frames/s  frame {number} {names.get(state, state)}  sigma {weights}  "
+        f"residual {residual:.2f} mm  coils {coils}  latency {latency:.2f} ms  lost {lost}"
+    )
+    return frames
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,127 @@
+"""What a person sees of a live run: the compilation notice, the status line, and Ctrl-C as a clean end."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from ..latency import NS_PER_MS, NS_PER_US, LogHistogram
+from ..live import LiveStatus, Source
+from ..pose import PoseStatus
+
+TERMINAL_PERIOD_S = 0.2
+PLAIN_PERIOD_S = 5.0
+COMPILING_AFTER_S = 1.0
+
+
+@contextmanager
+def announced_compilation() -> Iterator[None]:
+    """Says on stderr when the kernels are being compiled, and how long that took; silent when they only load."""
+    from .. import kernels
+
+    def announce() -> None:
+        _say("preparing the solver; the first time on this machine it is compiled, about 10 s ...")
+
+    def misses() -> int:
+        dispatchers = (kernels.prepare_frame, kernels.solve_fixed_speaker, kernels.solve_free_speaker)
+        return sum(sum(dispatcher.stats.cache_misses.values()) for dispatcher in dispatchers)
+
+    before, start = misses(), time.perf_counter()
+    notice = threading.Timer(COMPILING_AFTER_S, announce)
+    notice.daemon = True
+    notice.start()
+    try:
+        yield
+    finally:
+        notice.cancel()
+    if misses() > before:
+        _say(
+            f"the solver was compiled in {time.perf_counter() - start:.1f} s; the next start finds it ready."
+        )
+
+
+@contextmanager
+def watched(source: Source, status: LiveStatus) -> Iterator[None]:
+    """A status line on stderr and a clean end at Ctrl-C, for as long as a run lasts."""
+    with closed_by_interrupt(source), status_line(status):
+        yield
+
+
+@contextmanager
+def closed_by_interrupt(source: Source) -> Iterator[None]:
+    """The first Ctrl-C closes the source, so that the run ends as at its last frame; a second one interrupts."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def close(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, before)
+        source.close()
+
+    before = signal.signal(signal.SIGINT, close)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def status_line(status: LiveStatus) -> Iterator[None]:
+    """Shows the status on stderr from a thread of its own: in place on a terminal, else a line now and then."""
+    over = threading.Event()
+    thread = threading.Thread(target=_show, args=(status, over), name="status line", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(timeout=1.0)  # a terminal that was stopped must not keep the summary waiting
+
+
+def _show(status: LiveStatus, over: threading.Event) -> None:
+    terminal = sys.stderr.isatty()
+    frames, then = status.frames, time.perf_counter()
+    try:
+        while not over.wait(TERMINAL_PERIOD_S if terminal else PLAIN_PERIOD_S):
+            if status.frames == 0:
+                continue
+            now = time.perf_counter()
+            line = status_text(status, (status.frames - frames) / (now - then))
+            frames, then = status.frames, now
+            if terminal:
+                width = shutil.get_terminal_size().columns - 1
+                sys.stderr.write(f"\r{line[:width]:<{width}}")
+                sys.stderr.flush()
+            else:
+                _say(line)
+        if terminal:
+            sys.stderr.write("\r" + " " * (shutil.get_terminal_size().columns - 1) + "\r")
+            sys.stderr.flush()
+    except (OSError, ValueError):  # nobody reads stderr any more
+        return
+
+
+def status_text(status: LiveStatus, rate_hz: float) -> str:
+    """One line: frame rate, solve and arrival-to-sent p50/p99, residual, coils, drops."""
+    state = PoseStatus(status.status).name.lower()
+    residual = f"{status.residual_mm:.2f}" if status.valid_coils else "-"
+    return (
+        f"{rate_hz:.0f} frames/s  {state}  solve {_pair(status.solve_ns, NS_PER_US, 0)} us  "
+        f"sent after {_pair(status.arrival_to_sent_ns, NS_PER_MS, 2)} ms  residual {residual} mm  "
+        f"coils {status.valid_coils}/{len(status.coils_missing)}  dropped {status.dropped}"
+    )
+
+
+def _pair(histogram: LogHistogram, unit: float, digits: int) -> str:
+    values = (histogram.percentile(50.0), histogram.percentile(99.0))
+    return "/".join("-" if value is None else f"{value / unit:.{digits}f}" for value in values)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
