@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import yaml
-from tonguetrack import InputError
 from tonguetrack.model.build import (
     fill_missing_by_averaging,
     load_training_shapes,
@@ -12,6 +11,8 @@ from tonguetrack.model.build import (
 )
 from tonguetrack.model.mesh import Mesh, mesh_bytes, read_mesh
 from tonguetrack.model.tensor import cumulative_compactness
+
+from tonguetrack import InputError
 
 PAPER_SPEAKERS = [.5424, .7734, .8361, .8863, .9177, .9416, .9609, .9751, .9853, .9931, 1]  # fmt: skip
 PAPER_POSES = [.4931, .7903, .8771, .9185, .9420, .9591, .9715, .9808, .9875, .9923, .9960, .9983, 1]  # fmt: skip
@@ -172,7 +173,9 @@ def test_a_mesh_with_another_face_list_is_named(database, tmp_path, other):
     _, write = database
     vertices = np.zeros((5 if other == "vertices" else 4, 3))
     faces = FACES[::-1] if other == "faces" else FACES
-    (tmp_path / "C_u.ply").write_bytes(mesh_bytes(Mesh(vertices + np.arange(len(vertices))[:, None], faces), ".ply"))
+    (tmp_path / "C_u.ply").write_bytes(
+        mesh_bytes(Mesh(vertices + np.arange(len(vertices))[:, None], faces), ".ply")
+    )
     with pytest.raises(InputError, match=r"C_u.ply: its face list .* is not that of A_i.ply"):
         load_training_shapes(read_sample_database(write()))
 

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from tonguetrack import InputError
 from tonguetrack.drivers.frames import FrameOfReference, Recording
 from tonguetrack.tracker.coilmap import guess_coil_map
 from tonguetrack.tracker.session import Alignment, Energy, Session, load_session, session_toml
 from tonguetrack.tracker.setup import complete_setup, suggested_axes
+
+from tonguetrack import InputError
 
 FULL = """
 model = "0123456789abcdef"
@@ -32,7 +33,9 @@ box = 2
 
 def recording_of(coils, positions, **more):
     positions = np.asarray(positions, dtype=float)
-    return Recording(tuple(coils), positions, np.arange(len(positions)) / 100.0, 100.0, "test", source="take", **more)
+    return Recording(
+        tuple(coils), positions, np.arange(len(positions)) / 100.0, 100.0, "test", source="take", **more
+    )
 
 
 @pytest.fixture()
@@ -88,7 +91,10 @@ def test_an_empty_session_states_nothing(tmp_path):
         ('[alignment]\naxes = ["--x", "y", "z"]', "expected three of x, y, z"),
         ("[alignment]\nrotation = [[2,0,0],[0,1,0],[0,0,1]]", "rotation is not orthonormal"),
         ("[alignment]\nrotation = [[1,0],[0,1]]", "expected finite numbers in the shape"),
-        ('[alignment]\naxes = ["x","y","z"]\nrotation = [[1,0,0],[0,1,0],[0,0,1]]', "both 'axes' and 'rotation'"),
+        (
+            '[alignment]\naxes = ["x","y","z"]\nrotation = [[1,0,0],[0,1,0],[0,0,1]]',
+            "both 'axes' and 'rotation'",
+        ),
         ("[alignment]\nmidsagittal = 1", "midsagittal = 1: expected true or false"),
         ("[correspondences]\ntongue_tip = 1.5", "expected a whole number, the index of a vertex"),
         ("[speaker]\nweights = ['a']", "expected numbers only"),
@@ -114,7 +120,9 @@ def test_an_alignment_moves_raw_coils_to_the_model_frame(small_model, tongue):
 
     angle = 0.3
     rotation = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    preparation = Preparation(np.array([1, 0]), Alignment(rotation, np.array([1.0, 2.0, 3.0]), midsagittal=True))
+    preparation = Preparation(
+        np.array([1, 0]), Alignment(rotation, np.array([1.0, 2.0, 3.0]), midsagittal=True)
+    )
     moved = preparation.all_frames(tongue.positions)
     expected = tongue.positions[:, [1, 0]] @ rotation.T + [1, 2, 3]
     expected[..., 0] = 0
@@ -151,12 +159,17 @@ def test_names_of_the_field_become_roles_and_distance_decides_what_tb_means():
 def test_a_channel_without_data_gets_no_role():
     positions = np.array([[[0, 5.0, 0], [np.nan] * 3, [0, 30.0, 3]]])
     take = recording_of(["TT", "TB", "TD"], positions)
-    assert guess_coil_map(take.coils, take.positions, "take").roles == {"TT": "tongue_tip", "TD": "tongue_dorsum"}
+    assert guess_coil_map(take.coils, take.positions, "take").roles == {
+        "TT": "tongue_tip",
+        "TD": "tongue_dorsum",
+    }
 
 
 def test_names_that_say_nothing_are_asked_for():
     take = recording_of(["Ch1", "Ch2"], np.zeros((1, 2, 3)))
-    with pytest.raises(InputError, match="cannot tell from the channel names Ch1, Ch2 .* name them with --coils"):
+    with pytest.raises(
+        InputError, match="cannot tell from the channel names Ch1, Ch2 .* name them with --coils"
+    ):
         guess_coil_map(take.coils, take.positions, "take")
 
 
@@ -172,7 +185,11 @@ def test_a_stated_session_is_followed_to_the_letter(tmp_path, small_model, tongu
 def test_what_is_absent_is_estimated_and_said(small_model, tongue):
     setup = complete_setup(tongue, small_model, Session())
     told = " ".join(setup.decisions)
-    for part in ("coils (channel names", "alignment (default): none", "correspondences (estimated): tongue_tip ="):
+    for part in (
+        "coils (channel names",
+        "alignment (default): none",
+        "correspondences (estimated): tongue_tip =",
+    ):
         assert part in told
     assert setup.session.model_fingerprint == small_model.fingerprint
     assert set(setup.session.correspondences) == {"tongue_tip", "tongue_dorsum"}
@@ -187,10 +204,19 @@ def test_one_correspondence_may_be_fixed_by_hand_and_the_rest_estimated(small_mo
 @pytest.mark.parametrize(
     ("session", "sentence"),
     [
-        (Session(coils={"T9": "tongue_tip"}), "names the channel 'T9', which take does not have; its channels are T3"),
+        (
+            Session(coils={"T9": "tongue_tip"}),
+            "names the channel 'T9', which take does not have; its channels are T3",
+        ),
         (Session(speaker_weights=np.zeros(3)), "has 3 weights, but the model .* has 5 speaker modes"),
-        (Session(correspondences={"tongue_tip": 60, "tongue_dorsum": 1}), "tongue_tip = 60, but the model .* 0 to 59"),
-        (Session(correspondences={"tongue_back": 1}), "names the role 'tongue_back', but the tracked coils are"),
+        (
+            Session(correspondences={"tongue_tip": 60, "tongue_dorsum": 1}),
+            "tongue_tip = 60, but the model .* 0 to 59",
+        ),
+        (
+            Session(correspondences={"tongue_back": 1}),
+            "names the role 'tongue_back', but the tracked coils are",
+        ),
     ],
 )
 def test_a_session_that_contradicts_recording_or_model_is_refused(small_model, tongue, session, sentence):
