@@ -146,7 +146,7 @@ def fill_missing_by_averaging(tensor: FloatArray) -> tuple[FloatArray, list[tupl
     A cell becomes the average of the speaker's own mean shape and of the pose's mean shape over the
     other speakers, both over measured shapes only. Raises InputError where one of them does not exist.
     """
-    present = ~np.isnan(tensor).any(axis=2)
+    present = np.asarray(~np.isnan(tensor).any(axis=2))  # (speakers, poses)
     complete = tensor.copy()
     missing = [(int(i), int(j)) for i, j in np.argwhere(~present)]
     for speaker, pose in missing:

@@ -159,7 +159,7 @@ def _model_from_npz(data: bytes) -> TongueModel:
         tuple(map(int, header["midsagittal"])),
     )
     provenance = {str(k): str(v) for k, v in header["provenance"].items()}
-    faces = numbers("faces", 2)
+    faces = numbers("faces", 2).astype(np.int32)
     model = TongueModel(
         numbers("core", 3), numbers("origin", 1), faces, mode("speaker"), mode("pose"), marks, provenance
     )
@@ -216,7 +216,7 @@ def _model_from_published(content: Any, name: str) -> TongueModel:
     model = TongueModel(
         core.reshape(shape),
         _numbers(content["ShapeSpace"]["Origin"], "ShapeSpace/Origin"),
-        _numbers(content["ShapeSpace"]["Faces"], "ShapeSpace/Faces").reshape(-1, 3),
+        _numbers(content["ShapeSpace"]["Faces"], "ShapeSpace/Faces").astype(np.int32).reshape(-1, 3),
         Mode(_numbers(means["SpeakerMode"], "MeanWeights/SpeakerMode"), sizes["OriginalSpeakerMode"]),
         Mode(_numbers(means["PhonemeMode"], "MeanWeights/PhonemeMode"), sizes["OriginalPhonemeMode"]),
         provenance={"name": name, "source": f"published model file {name}"},

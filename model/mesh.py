@@ -63,7 +63,7 @@ def mesh_bytes(mesh: Mesh, suffix: str) -> bytes:
     """The mesh as the content of a file of that suffix (.ply: binary float32; .obj: text, 6 decimals)."""
     import trimesh
 
-    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    body: Any = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     if suffix.lower() == ".ply":
         return bytes(body.export(file_type="ply", encoding="binary", vertex_normal=False))
     if suffix.lower() == ".obj":

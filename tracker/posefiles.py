@@ -209,7 +209,7 @@ def _from_csv(text: str) -> TrackedPoses:
     roles = tuple(pairs)
 
     def numbered(pattern: str) -> FloatArray:
-        found = []
+        found: list[int] = []
         while pattern.format(len(found) + 1) in column:
             found.append(column[pattern.format(len(found) + 1)])
         return table[:, found]
@@ -263,14 +263,14 @@ def _from_npz(data: bytes) -> TrackedPoses:
     if header.get("format") != FORMAT_NAME:
         raise InputError(f"this .npz holds '{header.get('format')}', not '{FORMAT_NAME}'.")
     _check_version(header["version"])
-    arrays = {name: stored.get(name) for name in _ARRAYS}
+    arrays: dict[str, Any] = {name: stored.get(name) for name in _ARRAYS}
     frames = len(arrays["times_s"])
     for name, array in arrays.items():
         if array is not None and (len(array) != frames or array.dtype.kind not in "fi"):
             raise InputError(
                 f"'{name}' has {len(array)} rows of {array.dtype}, expected {frames} rows of numbers."
             )
-    fields = {name: header[name] for name in _HEADER_FIELDS}
+    fields: dict[str, Any] = {name: header[name] for name in _HEADER_FIELDS}
     return TrackedPoses(
         **arrays, **fields, roles=tuple(header["roles"]), correspondences=tuple(header["correspondences"])
     )

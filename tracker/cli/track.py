@@ -89,9 +89,9 @@ def run_track(args: argparse.Namespace) -> int:
     if args.realtime and not args.osc:
         raise InputError("--realtime paces a stream; say where to with --osc HOST:PORT.")
     if args.osc:
-        from ..streams.osc import parse_destination
+        from ..streams.osc import resolve
 
-        parse_destination(args.osc)
+        resolve(args.osc)
     model = named_model(args.model)
     session = read_session(args)
     print(f"model: {model.name} [{model.fingerprint}]", file=sys.stderr)
