@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from importlib.resources import as_file, files
+from importlib.resources.abc import Traversable
+from pathlib import Path
 
 from .. import InputError
 from ..drivers import Recording, open_recording
@@ -16,8 +19,13 @@ SESSION = ("tonguetrack.recordings", "demo.session.toml")
 
 def bundled_model() -> TongueModel:
     """The default model, made by this project's own pipeline from synthetic speakers: not anatomy."""
-    with as_file(_resource(*MODEL)) as path:
+    with bundled_model_path() as path:
         return load_model(path)
+
+
+def bundled_model_path() -> AbstractContextManager[Path]:
+    """The default model as a file, for as long as the context lasts."""
+    return as_file(_resource(*MODEL))
 
 
 def bundled_recording() -> tuple[Recording, Session]:
@@ -29,7 +37,7 @@ def bundled_recording() -> tuple[Recording, Session]:
     return recording, session
 
 
-def _resource(package: str, name: str):  # type: ignore[no-untyped-def]
+def _resource(package: str, name: str) -> Traversable:
     found = files(package) / name
     if not found.is_file():
         raise InputError(

@@ -122,10 +122,11 @@ def _report(monitor: Monitor, frames_before: int) -> int:
     lost = sum(stream.lost for stream in monitor.streams.values())
     number, _, state = newest.last
     residual, coils, latency = quality.last
-    names = {int(status): status.name.lower() for status in PoseStatus}
+    known = [int(status) for status in PoseStatus]
+    name = PoseStatus(state).name.lower() if state in known else state
     weights = " ".join(f"{weight:+.2f}" for weight in sigma.last[:8])
     _say(
-        f"{frames - frames_before} frames/s  frame {number} {names.get(state, state)}  sigma {weights}  "
+        f"{frames - frames_before} frames/s  frame {number} {name}  sigma {weights}  "
         f"residual {residual:.2f} mm  coils {coils}  latency {latency:.2f} ms  lost {lost}"
     )
     return frames

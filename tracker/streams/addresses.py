@@ -47,7 +47,7 @@ class Address:
 
     @cached_property
     def _pattern(self) -> re.Pattern[str]:
-        return re.compile(re.escape(self.path).replace(re.escape("<k>"), "[0-9]{1,4}"))
+        return re.compile(re.escape(self.path).replace(re.escape("<k>"), "[0-9]{1,3}"))
 
     def matches(self, path: str) -> bool:
         return self._pattern.fullmatch(path) is not None

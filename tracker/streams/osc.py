@@ -6,6 +6,7 @@ import socket
 import struct
 import time
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
@@ -198,7 +199,7 @@ class OscSink:
                 pass
 
 
-def parse_host_port(text: str) -> tuple[str, int]:
+def parse_destination(text: str) -> tuple[str, int]:
     """ "127.0.0.1:9000", "name:9000" or "[::1]:9000" as host and port."""
     host, colon, port = text.strip().rpartition(":")
     if host.startswith("[") and host.endswith("]"):
@@ -215,7 +216,7 @@ def parse_host_port(text: str) -> tuple[str, int]:
 def resolve(text: str) -> tuple[socket.AddressFamily, tuple[object, ...]]:
     """HOST:PORT as the address family and the numeric address that sockets take; IPv4 where there is a choice,
     because that is where receivers listen when someone says localhost."""
-    host, port = parse_host_port(text)
+    host, port = parse_destination(text)
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as reason:
@@ -224,7 +225,7 @@ def resolve(text: str) -> tuple[socket.AddressFamily, tuple[object, ...]]:
     return family, address
 
 
-def _message(row: Address, values: Iterable[object], path: str = "") -> bytes:
+def _message(row: Address, values: Iterable[Any], path: str = "") -> bytes:
     """One OSC message for a row of the table; `path` where the row's holds a <k>."""
     builder = OscMessageBuilder(path or row.path)
     values = list(values)
