@@ -60,6 +60,16 @@ def test_the_search_is_deterministic_and_ordered_from_tip_to_root(small_model):
     assert places == sorted(places)
 
 
+def test_the_order_of_naming_does_not_matter(small_model):
+    coils = np.random.default_rng(6).normal(size=(30, 3, 3)) + small_model.mean_vertices()[[2, 8, 16]]
+    found = estimate_correspondences(small_model, coils, ROLES, Energy())
+    mixed = [2, 0, 1]
+    again = estimate_correspondences(
+        small_model, np.ascontiguousarray(coils[:, mixed]), [ROLES[i] for i in mixed], Energy()
+    )
+    assert [again.vertices[mixed.index(i)] for i in range(3)] == list(found.vertices)
+
+
 def test_a_lateral_coil_may_leave_the_mid_sagittal_plane(small_model):
     shape = small_model.mean_vertices()
     coils = np.repeat(shape[None, [3, 29, 15]], 5, axis=0)

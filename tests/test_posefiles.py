@@ -27,7 +27,8 @@ def run(small_model):
     positions[20:25, 1] = np.nan
     positions[40:45] = np.nan
     take = Recording(("TT", "TB", "TD"), positions, np.arange(60) / 200, 200.0, "test", source="take 1")
-    return track_recording(take, small_model, Session(correspondences=dict(tongue_tip=3, tongue_blade=9, tongue_dorsum=15)))  # fmt: skip
+    vertices = {"tongue_tip": 3, "tongue_blade": 9, "tongue_dorsum": 15}
+    return track_recording(take, small_model, Session(correspondences=vertices))
 
 
 FIELDS = (

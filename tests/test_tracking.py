@@ -204,14 +204,14 @@ def test_every_frame_is_at_or_below_a_tight_minimiser_of_the_published_energy(
             gamma = 5.0 if t else 0.0
             q = poses.coils[t][present].ravel()
 
-            def reduced(x, t=t, q=q, previous=previous, gamma=gamma, rows=rows):
-                full = weights[t].copy()
+            def reduced(x, at, free, q, previous, gamma, rows):
+                full = at.copy()
                 full[free] = x
                 value, gradient = energy(full, q, previous, gamma, rows)
                 return value, gradient[free]
 
             reference = minimize(
-                reduced, previous[free], jac=True, method="L-BFGS-B", bounds=bounds[free],
+                reduced, previous[free], args=(weights[t], free, q, previous, gamma, rows), jac=True, method="L-BFGS-B", bounds=bounds[free],
                 options={"ftol": 1e-15, "gtol": 1e-9, "maxiter": 1000, "maxfun": 5000, "maxcor": 20},
             )  # fmt: skip
             worst = max(worst, poses.energies[t] / reference.fun - 1)

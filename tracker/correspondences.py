@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 from .. import InputError
 from ..model.midsagittal import midsagittal_vertices, upper_surface_vertices
 from ..model.multilinear import TongueModel
-from .coilmap import LATERAL_ROLES
+from .coilmap import LATERAL_ROLES, TONGUE_ROLES
 from .pose import FloatArray
 from .session import Energy
 from .solver import FixedSpeakerSolver, FreeSpeakerSolver
 
+TIP_TO_ROOT = TONGUE_ROLES[4]
 BOX_WHILE_SEARCHING = 1.0
 RANDOM_SHAPES = 60
 MAX_REFITS = 20
@@ -62,12 +63,14 @@ def estimate_correspondences(
 ) -> Correspondences:
     """Correspondences from prepared coils (frames, n, 3), mm in the model frame; roles in the same order.
 
-    Mid-sagittal coils keep the order of their roles, tip to root, along the contour; a lateral coil may
-    sit anywhere on the upper surface. Deterministic.
+    Mid-sagittal coils keep the order of their roles along the contour, tip to root (roles of one's own
+    naming: the order given); a lateral coil may sit anywhere on the upper surface. Deterministic.
     """
     contour = midsagittal_vertices(model)
     lateral = [index for index, role in enumerate(roles) if role in LATERAL_ROLES]
     middle = [index for index in range(len(roles)) if index not in lateral]
+    if all(roles[index] in TIP_TO_ROOT for index in middle):
+        middle.sort(key=lambda index: TIP_TO_ROOT.index(roles[index]))
     if len(contour) < max(len(middle), 1):
         raise InputError(
             f"the model '{model.name}' has {len(contour)} vertices of its upper surface near the plane x = 0, too "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -99,6 +100,8 @@ def run_track(args: argparse.Namespace) -> int:
         print(f"left out: {path}: {reason}", file=sys.stderr)
     for file in (output for job in jobs for output in job.outputs.values()):
         file.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(file.parent, os.W_OK):  # known before the work is done, not after
+            raise InputError(f"{file}: no permission to write in {file.parent}; choose another place.")
 
     reports: list[dict[str, Any]] = []
     failures = 0
