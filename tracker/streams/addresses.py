@@ -185,8 +185,7 @@ versions may add both. `tonguetrack monitor` shows what arrives, and names what 
 
 {address_table()}
 
-K: coefficients of the pose; m: weights of the speaker (without any, `/tongue/speaker` is left out);
-n: coils. `<k>` counts from 0. The one-value addresses are left out when a frame would not fit otherwise
+K: coefficients of the pose; m: weights of the speaker; n: coils; each may be 0. `<k>` counts from 0. The one-value addresses are left out when a frame would not fit otherwise
 (K above 18).
 
 | status | meaning |

@@ -108,13 +108,12 @@ def info_datagrams(info: StreamInfo) -> list[bytes]:
         info.rate_hz,
     ]
     messages = [
+        _message(SPEAKER, info.speaker_weights.tolist()),
         _message(INFO, about),
         _message(COILS, [_osc_text(role) for role in info.roles]),
         _message(MEAN, info.mean.tolist()),
         _message(SPREAD, info.sigma.tolist()),
     ]
-    if len(info.speaker_weights):
-        messages.insert(0, _message(SPEAKER, info.speaker_weights.tolist()))
     groups: list[list[bytes]] = [[]]
     for message in messages:
         if _bundle_bytes([message]) > MAX_DATAGRAM_BYTES:
@@ -231,7 +230,7 @@ def _message(row: Address, values: Iterable[Any], path: str = "") -> bytes:
     values = list(values)
     tags = [argument.tag for argument in row.arguments]
     if row.arguments[-1].count:
-        tags += tags[-1:] * (len(values) - len(tags))
+        tags[-1:] = tags[-1:] * (len(values) - len(tags) + 1)
     for value, tag in zip(values, tags, strict=True):
         builder.add_arg(value, tag)
     return bytes(builder.build().dgram)
