@@ -185,8 +185,8 @@ versions may add both. `tonguetrack monitor` shows what arrives, and names what 
 
 {address_table()}
 
-K: coefficients of the pose; m: weights of the speaker; n: coils; each may be 0. `<k>` counts from 0. The one-value addresses are left out when a frame would not fit otherwise
-(K above 18).
+K: coefficients of the pose; m: weights of the speaker; n: coils; m and n may be 0. `<k>` counts from 0. The
+one-value addresses are left out when a frame would not fit otherwise (K above 18).
 
 | status | meaning |
 |---|---|
