@@ -1,0 +1,178 @@
+"""The tongue's surface from a speaker and an articulation."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .anatomy import Anatomy
+from .articulation import Articulation
+from .template import CONTROL_POINTS, TongueTemplate, tongue_template
+
+FloatArray = NDArray[np.float64]
+
+HINGE = np.array([88.0, 42.0])  # (y, z) mm of the jaw's axis, reference speaker
+REST_JAW_DEG = 4.0  # the neutral contour holds the jaw of a schwa
+# Half width and depth of the cross-section (mm) at places along the contour, mm from the tip: narrow and
+# thin at the tip, wide and deep at the dorsum.
+PLACES = np.array([-30.0, -22.0, -12.0, -6.0, 0.0, 5.0, 12.0, 24.0, 38.0, 52.0, 66.0, 80.0, 110.0])
+HALF_WIDTHS = np.array([15.0, 14.0, 12.5, 11.5, 10.5, 12.5, 16.0, 21.0, 23.5, 23.0, 20.0, 18.0, 17.0])
+DEPTHS = np.array([4.0, 3.4, 2.8, 2.6, 2.8, 3.4, 6.0, 11.5, 15.0, 15.0, 12.0, 9.0, 7.5])
+AIR_CHANNEL_MM = 1.2  # the phones are vowels and sibilants: air passes along the middle
+CONTACT_SHARPNESS = 2.2  # 1/mm: how closely the surface follows what it touches
+
+
+def tongue_surface(anatomy: Anatomy, articulation: Articulation) -> FloatArray:
+    """(n, 3) mm: the vertices of `tongue_template()` for this speaker in this articulation.
+
+    The contour is moved by muscles and jaw, swept across by a width and a depth that keep the volume, and
+    pressed against teeth, palate and pharyngeal wall without crossing them.
+    """
+    template = tongue_template()
+    return _pressed_against_walls(_swept(anatomy, articulation, template), anatomy)
+
+
+def enclosed_volume(vertices: FloatArray) -> float:
+    """mm^3 between the surface and a fan that closes its open base, seen from the fan's centre."""
+    template = tongue_template()
+    grid = np.arange(len(vertices)).reshape(len(template.s), len(template.theta))
+    rim = np.concatenate([grid[0], grid[1:, -1], grid[-1, -2::-1], grid[-2:0:-1, 0]])
+    # Seen from the rim's centre, the closing fan has no volume of its own.
+    a, b, c = (vertices[template.faces[:, corner]] - vertices[rim].mean(axis=0) for corner in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def _neutral_contour(anatomy: Anatomy, template: TongueTemplate) -> FloatArray:
+    """(rows, 2) y, z mm of the speaker at rest."""
+    points = CONTROL_POINTS.copy()
+    points[:, 1] += 8.0  # heights above the blade's level, so that thickness stretches downwards
+    below = points[:, 1] < 0.0
+    points[below, 1] *= anatomy.thickness
+    back = points[:, 0] > 45.0
+    points[back & below, 1] *= anatomy.pharynx / anatomy.thickness
+    points[:, 1] -= 8.0
+    points[:, 0] *= anatomy.mouth
+    tip = slice(3, 6)
+    points[tip, 0] -= 8.0 * (anatomy.blade - 1.0)
+    return np.asarray(template.basis @ points * anatomy.size)
+
+
+def _contour(anatomy: Anatomy, articulation: Articulation, template: TongueTemplate) -> FloatArray:
+    """(rows, 2) y, z mm of the mid-sagittal contour, before contact."""
+    a = articulation
+    size = anatomy.size
+    s = template.s - template.tip_s  # mm along the reference contour from the tip, underside negative
+    contour = _neutral_contour(anatomy, template)
+    normal = _normals(contour)
+
+    body = _plateau(s, 6.0, 66.0, 9.0)
+    contour[:, 0] -= size * a.body_front_mm * body
+    contour[:, 1] += size * a.body_up_mm * _plateau(s, 10.0, 62.0, 9.0)
+    contour[:, 0] -= size * a.root_front_mm * _plateau(s, 66.0, 140.0, 8.0)
+
+    place = 14.0 + 52.0 * a.arch_place
+    contour += size * a.arch_mm * _bell(s, place, 12.5)[:, None] * normal
+
+    at_tip = _plateau(s, -9.0, 5.0, 4.5)
+    contour[:, 0] -= size * a.tip_front_mm * _plateau(s, -14.0, 8.0, 5.0)
+    contour[:, 1] += size * a.tip_up_mm * at_tip
+    contour[:, 1] += size * a.blade_up_mm * _bell(s, 11.0, 8.0)
+
+    share = 1.0 - 0.72 * _plateau(s, 58.0, 200.0, 14.0)  # the root hardly follows the jaw
+    angle = np.radians(a.jaw_deg - REST_JAW_DEG) * share
+    hinge = HINGE * size * np.array([anatomy.mouth, 1.0])
+    rest = contour - hinge
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.column_stack(
+        [hinge[0] + cos * rest[:, 0] - sin * rest[:, 1], hinge[1] + sin * rest[:, 0] + cos * rest[:, 1]]
+    )
+
+
+def _swept(anatomy: Anatomy, articulation: Articulation, template: TongueTemplate) -> FloatArray:
+    """(n, 3) mm before contact: every row starts at the contour and bends down on both sides.
+
+    The tongue is incompressible: what the profile loses it gains in width, within limits.
+    """
+    swept = _swept_unscaled(anatomy, articulation, template)
+    swept[:, 0] *= float(np.clip(_rest_volume(anatomy) / enclosed_volume(swept), 0.86, 1.16))
+    return swept
+
+
+@lru_cache(maxsize=64)
+def _rest_volume(anatomy: Anatomy) -> float:
+    return enclosed_volume(_swept_unscaled(anatomy, Articulation(jaw_deg=REST_JAW_DEG), tongue_template()))
+
+
+def _swept_unscaled(anatomy: Anatomy, articulation: Articulation, template: TongueTemplate) -> FloatArray:
+    a = articulation
+    size = anatomy.size
+    s = template.s - template.tip_s
+    theta = np.radians(template.theta)
+    contour = _contour(anatomy, a, template)
+    normal = _normals(contour)
+    sine = np.sin(theta)[None, :]
+    half_width = size * anatomy.width * _smooth(np.interp(s, PLACES, HALF_WIDTHS))
+    depth = size * _smooth(np.interp(s, PLACES, DEPTHS)) * (1.0 - 0.45 * a.flat * _plateau(s, 0.0, 60.0, 8.0))
+    x = half_width[:, None] * sine
+    drop = depth[:, None] * (1.0 - np.cos(theta))[None, :]
+    pressed_side = np.exp(-0.5 * ((np.abs(template.theta) - 58.0) / 20.0) ** 2)[None, :]
+    drop -= size * a.brace_mm * _plateau(s, 8.0, 56.0, 9.0)[:, None] * pressed_side
+    groove = size * a.groove_mm * _bell(s, 6.0 + 60.0 * a.groove_place, 11.0)
+    groove += 0.3 * size * _plateau(s, 8.0, 60.0, 8.0)
+    drop += groove[:, None] * np.exp(-0.5 * (x / (4.2 * size)) ** 2)
+    drop -= size * a.tilt_mm * _plateau(s, -10.0, 60.0, 10.0)[:, None] * sine
+    y = contour[:, 0, None] - drop * normal[:, 0, None]
+    z = contour[:, 1, None] - drop * normal[:, 1, None]
+    return np.stack([x, y, z], axis=2).reshape(-1, 3)
+
+
+def _pressed_against_walls(vertices: FloatArray, anatomy: Anatomy) -> FloatArray:
+    """The surface inside teeth, palate and pharyngeal wall, following them where it would cross.
+
+    Teeth stand beside the tongue only above the edge of the palate.
+    """
+    pressed = vertices.copy()
+    between_teeth = _plateau(vertices[:, 2], -7.0 * anatomy.size, 60.0, 3.0) * _plateau(
+        vertices[:, 1], -3.0, 50.0, 4.0
+    )
+    beside = 0.97 * anatomy.arch_half_width(vertices[:, 1]) - np.abs(vertices[:, 0])
+    pressed[:, 0] -= np.sign(vertices[:, 0]) * (_soft_positive(beside) - beside) * between_teeth
+    channel = AIR_CHANNEL_MM * np.exp(-0.5 * (vertices[:, 0] / (6.0 * anatomy.size)) ** 2)
+    room = anatomy.palate_z(pressed[:, 0], vertices[:, 1]) - channel - vertices[:, 2]
+    under_palate = _plateau(vertices[:, 1], -7.0, 72.0 * anatomy.size * anatomy.mouth, 2.5)
+    pressed[:, 2] -= (_soft_positive(room) - room) * under_palate
+    wall = anatomy.wall_mm * anatomy.size - 12.0 - vertices[:, 1]
+    pressed[:, 1] -= _soft_positive(wall) - wall
+    return pressed
+
+
+def _soft_positive(room: FloatArray) -> FloatArray:
+    """A smooth function above max(room, 0) that comes close to it within a millimetre."""
+    return np.logaddexp(0.0, CONTACT_SHARPNESS * room) / CONTACT_SHARPNESS
+
+
+def _normals(contour: FloatArray) -> FloatArray:
+    """(rows, 2) unit normals out of the tongue, smoothed along the contour."""
+    tangent = np.gradient(contour, axis=0)
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    normal = np.column_stack([_smooth(normal[:, 0]), _smooth(normal[:, 1])])
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def _smooth(values: FloatArray) -> FloatArray:
+    """Three passes of a (1, 2, 1) average along the contour, ends kept."""
+    for _ in range(3):
+        padded = np.concatenate([values[:1], values, values[-1:]])
+        values = 0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:]
+    return values
+
+
+def _bell(s: FloatArray, place: float, width: float) -> FloatArray:
+    return np.asarray(np.exp(-0.5 * ((s - place) / width) ** 2))
+
+
+def _plateau(s: FloatArray, start: float, end: float, ramp: float) -> FloatArray:
+    """About 1 between start and end, 0 outside, with smooth ramps."""
+    return np.asarray(0.25 * (1.0 + np.tanh((s - start) / ramp)) * (1.0 + np.tanh((end - s) / ramp)))
