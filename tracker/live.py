@@ -240,17 +240,17 @@ def _loop(
     source: Source, tracker: Tracker, sinks: tuple[Sink, ...], status: LiveStatus, seconds: float
 ) -> None:
     clock, step, add = time.perf_counter_ns, tracker.step, status.add
-    end_s: float | None = None
+    last_s: float | None = None  # device time from which no further frame is wanted
     for frame in source:
-        if end_s is None:
-            end_s = frame.device_time_s + seconds
-        elif frame.device_time_s >= end_s:
-            break
         before_ns = clock()
         pose = step(frame)
         for sink in sinks:
             sink.send(pose)
         add(pose, before_ns, clock())
+        if last_s is None:
+            last_s = frame.device_time_s + seconds - 1.0 / source.rate_hz - 1e-6
+        if frame.device_time_s >= last_s:
+            break
 
 
 def _summary(source: Source, info: StreamInfo, status: LiveStatus) -> Summary:

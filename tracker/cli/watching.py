@@ -18,6 +18,7 @@ from ..pose import PoseStatus
 TERMINAL_PERIOD_S = 0.2
 PLAIN_PERIOD_S = 5.0
 COMPILING_AFTER_S = 1.0
+LEGEND = "rate, status, solve p50/p99, arrival to sent p50/p99, residual, coils valid, frames dropped:"
 
 
 @contextmanager
@@ -88,6 +89,8 @@ def _show(status: LiveStatus, over: threading.Event) -> None:
     terminal = sys.stderr.isatty()
     frames, then = status.frames, time.perf_counter()
     try:
+        if terminal:
+            _say(LEGEND)
         while not over.wait(TERMINAL_PERIOD_S if terminal else PLAIN_PERIOD_S):
             if status.frames == 0:
                 continue
@@ -108,13 +111,13 @@ def _show(status: LiveStatus, over: threading.Event) -> None:
 
 
 def status_text(status: LiveStatus, rate_hz: float) -> str:
-    """One line: frame rate, solve and arrival-to-sent p50/p99, residual, coils, drops."""
+    """One line as `LEGEND` says, short enough for a terminal of 80 columns."""
     state = PoseStatus(status.status).name.lower()
     residual = f"{status.residual_mm:.2f}" if status.valid_coils else "-"
     return (
-        f"{rate_hz:.0f} frames/s  {state}  solve {_pair(status.solve_ns, NS_PER_US, 0)} us  "
-        f"sent after {_pair(status.arrival_to_sent_ns, NS_PER_MS, 2)} ms  residual {residual} mm  "
-        f"coils {status.valid_coils}/{len(status.coils_missing)}  dropped {status.dropped}"
+        f"{rate_hz:.0f} Hz {state}  solve {_pair(status.solve_ns, NS_PER_US, 0)} us  "
+        f"sent {_pair(status.arrival_to_sent_ns, NS_PER_MS, 2)} ms  {residual} mm  "
+        f"{status.valid_coils}/{len(status.coils_missing)} coils  {status.dropped} dropped"
     )
 
 
