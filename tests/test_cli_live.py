@@ -178,6 +178,27 @@ def test_on_a_terminal_the_status_is_one_line_that_is_cleared(folder, receiver):
     assert lines[-1] == ""
 
 
+def test_the_bundled_recording_session_and_model_belong_together_and_say_synthetic():
+    model = bundled.bundled_model()
+    recording, session = bundled.bundled_recording()
+    setup = complete_setup(recording, model, session)
+    assert "synthetic" in model.name
+    assert session.model_fingerprint == model.fingerprint
+    assert session.speaker_weights is not None, "the demo compiles the fixed-speaker solver only"
+    assert not any("estimated" in decision for decision in setup.decisions)
+
+
+def test_the_demo_runs_as_installed(receiver):
+    command = ("-c", "import sys; from tonguetrack.tracker.cli import main; sys.exit(main(sys.argv[1:]))")
+    code, out, err = ended(started(*command, "demo", "--fast", "--json", "--osc", address_of(receiver)))
+    assert code == 0, err
+    summary = json.loads(out)
+    assert "synthetic" in summary["model"]
+    assert summary["status_shares"]["ok"] == 1.0
+    assert summary["residual_mm"]["median"] < 2.0
+    assert summary["gaps"] == 0
+
+
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "soon"])
 def test_seconds_are_a_positive_number(text, capsys):
     with pytest.raises(SystemExit) as end:
