@@ -117,7 +117,7 @@ INFO = Address(
         Argument("rate", "f", "Hz"),
     ),
     "start, every second",
-    "What is streamed. A model that was not made from real tongues has the word synthetic in its name.",
+    "What is streamed. The bundled model, which is not anatomy, has the word synthetic in its name.",
 )
 COILS = Address(
     "/tongue/coils",
