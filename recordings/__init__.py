@@ -1,0 +1,1 @@
+"""Small sample recordings of synthetic speakers, each with its truth; see make_recordings.sh."""

@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from tonguetrack.drivers import FrameOfReference, Recording, open_recording, write_recording
-from tonguetrack.atomic import write_atomically
 from tonguetrack.drivers.files.authors import authors_bytes
 from tonguetrack.drivers.files.npz import npz_bytes
 from tonguetrack.drivers.files.recognise import parse
 from tonguetrack.drivers.files.tabular import table_bytes
 
 from tonguetrack import InputError
+from tonguetrack.atomic import write_atomically
 
 WRITERS = {"a.csv": table_bytes, "a.npz": npz_bytes}
 COORDINATES = st.floats(-999, 999) | st.just(float("nan"))

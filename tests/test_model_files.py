@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tonguetrack import InputError
 from tonguetrack.model.files import load_model, model_bytes, save_model
+
+from tonguetrack import InputError
 
 
 def test_our_file_keeps_everything(small_model, tmp_path):

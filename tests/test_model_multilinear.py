@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+
 from tonguetrack import InputError
 
 
@@ -26,7 +27,9 @@ def test_fixing_the_speaker_leaves_a_linear_model_with_the_same_shapes(small_mod
     np.testing.assert_allclose(speaker.vertices(p), small_model.vertices(s, p), atol=1e-12)
     assert speaker.directions.shape == (4, small_model.origin.size)
     np.testing.assert_allclose(
-        speaker.vertices(2 * p) - speaker.vertices(p), speaker.vertices(p) - speaker.vertices(0 * p), atol=1e-12
+        speaker.vertices(2 * p) - speaker.vertices(p),
+        speaker.vertices(p) - speaker.vertices(0 * p),
+        atol=1e-12,
     )
 
 

@@ -16,7 +16,9 @@ def moving_coils(model, frames=300, seed=0):
     """(frames, 3, 3) coils of a smooth movement of the model's own poses, with noise."""
     random = np.random.default_rng(seed)
     t = np.linspace(0, 4 * np.pi, frames)[:, None]
-    swing = np.sin(t + random.uniform(0, 2 * np.pi, model.pose.size)) * random.uniform(0.3, 1, model.pose.size)
+    swing = np.sin(t + random.uniform(0, 2 * np.pi, model.pose.size)) * random.uniform(
+        0.3, 1, model.pose.size
+    )
     speaker = model.for_speaker(model.speaker.mean).at(VERTICES)
     shapes = [speaker.vertices(model.pose.mean + x * model.pose.sigma) for x in swing]
     return np.array(shapes) + random.normal(scale=0.2, size=(frames, 3, 3))

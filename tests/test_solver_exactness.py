@@ -114,7 +114,9 @@ def test_the_energy_is_the_formula_and_its_derivatives_are_right(small_model):
         gradient, hessian = np.zeros(size), np.zeros((size, size))
         case.coherent = True
 
-        def energy_at(weights, case=case, beta=beta, gamma=gamma, box=box, jacobian=jacobian, residual=residual):
+        def energy_at(
+            weights, case=case, beta=beta, gamma=gamma, box=box, jacobian=jacobian, residual=residual
+        ):
             return kernels.free_energy(
                 case.coils, np.array(case.model.origin), np.array(case.model.core), box, case.energy.alpha, beta,
                 gamma, case.previous, weights, jacobian, residual,

@@ -20,7 +20,8 @@ MAX_BYTES = 4 * 1024**3
 
 
 def is_npz(head: bytes) -> bool:
-    return head.startswith(b"PK\x03\x04")
+    """Whether an archive begins with our mark, as `npz_bytes` writes it; models and poses are .npz too."""
+    return head.startswith(b"PK\x03\x04") and head[30:].startswith(f"{MARK}.npy".encode())
 
 
 def npz_bytes(recording: Recording) -> bytes:

@@ -104,6 +104,7 @@ FORMATS: tuple[Format, ...] = (
 
 # Beginnings of files that people keep next to recordings, and what to say about them.
 _OTHERS: tuple[tuple[bytes, str], ...] = (
+    (b"# tonguetrack poses", "what `tonguetrack track` wrote, poses and not a recording"),
     (b"RIFF", "a WAV sound, not a record of coils"),
     (b"fLaC", "a FLAC sound, not a record of coils"),
     (b"NIST_1A", "a NIST sound, not a record of coils"),
@@ -115,6 +116,10 @@ _OTHERS: tuple[tuple[bytes, str], ...] = (
     (b"\xff\xd8\xff", "a picture, not a record of coils"),
     (b"%PDF", "a PDF document, not a record of coils"),
     (b"\x1f\x8b", "a gzip archive; unpack it first"),
+    (
+        b"PK\x03\x04",
+        "a .npz or other zip archive without a recording; a tongue model is for `tonguetrack model info`",
+    ),
 )
 
 
@@ -135,9 +140,10 @@ def recognise(head: Head, name: str) -> Format:
     """The format whose content this is; InputError says what it is instead, if that can be told."""
     if head.size == 0:
         raise InputError(f"{name}: the file is empty.")
-    for form in FORMATS:
-        if form.fits(head):
-            return form
+    if not head.data.startswith(tuple(start for start, _ in _OTHERS)) or npz.is_npz(head.data):
+        for form in FORMATS:
+            if form.fits(head):
+                return form
     raise InputError(f"{name}: {_what_else(head, name)}.")
 
 
