@@ -1,0 +1,341 @@
+"""The README and the pages in docs: every command in them runs somewhere, every link leads somewhere.
+
+`README` and `DOCS` below say how each command is run. A command that is not listed fails the test, and so
+does a line here that no page contains any more.
+"""
+
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+SAMPLES = ("recordings/demo.csv", "recordings/demo.session.toml", "model/data/default.npz")
+
+BY_CI = "by .ci/run, word for word"
+HERE = "here, in a folder of its own, in the order of the page"
+WITH_REFERENCE = "here, where the reference data are"
+ELSEWHERE = "by another test: "
+
+README = {
+    "sudo apt-get install -y python3-venv": BY_CI,
+    "python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/tonguetrack demo": BY_CI,
+    "python3 -m venv .venv && .venv/bin/pip install -e '.[dev]' && .venv/bin/pytest -n 2": BY_CI,
+    ".venv/bin/tonguetrack monitor --seconds 20": ELSEWHERE + "test_the_demo_arrives_at_the_monitor",
+    "python3 -m venv .venv && .venv/bin/pip install .": BY_CI,
+    ".venv/bin/tonguetrack model build PATH/sampleDatabase.yaml -o ultrax.npz": WITH_REFERENCE,
+    ".venv/bin/tonguetrack track PATH/emu_webapp --model ultrax.npz --out poses.csv": WITH_REFERENCE,
+    ".venv/bin/tonguetrack info recordings/demo.csv": HERE,
+    ".venv/bin/tonguetrack track recordings/demo.csv --out poses.csv --save-session session.toml": HERE,
+    ".venv/bin/tonguetrack track recordings/demo.csv --session session.toml --out poses.npz": HERE,
+    ".venv/bin/tonguetrack mesh poses.csv --frame 100 -o tongue.ply": HERE,
+    ".venv/bin/tonguetrack track recordings/demo.csv --session session.toml --osc 127.0.0.1:9000 --realtime": HERE,
+    ".venv/bin/tonguetrack convert recordings/demo.csv demo.json": HERE,
+    ".venv/bin/tonguetrack simulate recording simulated.csv --seconds 4": HERE,
+    ".venv/bin/tonguetrack bench": ELSEWHERE + "test_bench.py, with smaller numbers",
+}
+
+DOCS = {
+    ".venv/bin/tonguetrack info recordings/demo.csv": HERE,
+    ".venv/bin/tonguetrack track recordings/demo.csv --out poses.csv --save-session session.toml": HERE,
+    ".venv/bin/tonguetrack mesh poses.csv --frame 100 -o tongue.ply": HERE,
+    ".venv/bin/tonguetrack mesh poses.csv --every 50 -o tongue.ply": HERE,
+    ".venv/bin/tonguetrack convert recordings/demo.csv demo.npz": HERE,
+    ".venv/bin/tonguetrack model build PATH/sampleDatabase.yaml -o ultrax.npz": WITH_REFERENCE,
+    ".venv/bin/tonguetrack model info ultrax.npz": WITH_REFERENCE,
+    ".venv/bin/tonguetrack model convert ultrax.npz ultrax.yaml": WITH_REFERENCE,
+    ".venv/bin/tonguetrack model synthetic speakers": HERE,
+    ".venv/bin/tonguetrack model build speakers/samples.yaml -o synthetic.npz --speaker-modes 4 --pose-modes 3": HERE,
+    "python3 -m venv .venv && .venv/bin/pip install -e '.[dev]' && .venv/bin/pytest -n 2": BY_CI,
+    ".venv/bin/ruff check . && .venv/bin/ruff format --check .": BY_CI,
+    ".venv/bin/pip install '.[dev]' && cd docs && ../.venv/bin/mypy -p tonguetrack --config-file ../pyproject.toml": BY_CI,
+}
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(
+        rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+
+
+def commands(*pages: Path) -> list[str]:
+    lines = [line.strip() for page in pages for block in blocks(page, "sh") for line in block.splitlines()]
+    return [line for line in lines if line]
+
+
+def doc_pages() -> list[Path]:
+    return [page for page in PAGES if page.parent.name == "docs"]
+
+
+# Completeness ---------------------------------------------------------------------------------------
+
+
+def test_every_command_of_the_readme_is_run_somewhere():
+    assert set(commands(ROOT / "README.md")) == set(README)
+
+
+def test_every_command_of_the_docs_is_run_somewhere():
+    assert set(commands(*doc_pages())) == set(DOCS)
+
+
+def test_what_ci_runs_it_takes_from_the_readme():
+    """The two main commands are not copied into .ci/run: it reads them."""
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    for name in ("tonguetrack demo", "pytest -n 2", "python3-venv"):
+        assert f"readme_command '{name}'" in script
+
+
+def test_the_flags_that_pages_name_exist():
+    known = subprocess.run(
+        [tool(), "--help"], capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "200"}
+    ).stdout
+    helps = [known]
+    for command in (
+        "demo",
+        "track",
+        "mesh",
+        "info",
+        "convert",
+        "monitor",
+        "bench",
+        "model build",
+        "simulate recording",
+    ):
+        done = subprocess.run(
+            [tool(), *command.split(), "--help"], capture_output=True, text=True, check=True
+        )
+        helps.append(done.stdout)
+    for page in PAGES:
+        text = re.sub(
+            r"```(?:sh|python|toml|yaml)\n.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL
+        )
+        for flag in re.findall(r"(?<![\w-])--[a-z][a-z-]+", text):
+            assert any(flag in text for text in helps), f"{page.name} names {flag}"
+
+
+# Links ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_internal_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if "://" in target:
+            continue
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{page.name} links to {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+            slugs = [re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings]
+            assert anchor in slugs, f"{page.name} links to {target}"
+
+
+def test_every_page_can_be_reached_from_the_readme():
+    reached, todo = set(), [ROOT / "README.md"]
+    while todo:
+        page = todo.pop()
+        reached.add(page)
+        for target in re.findall(r"\]\(([^)#\s]+\.md)", page.read_text(encoding="utf-8")):
+            file = (page.parent / target).resolve() if "://" not in target else page
+            if file not in reached:
+                todo.append(file)
+    assert {page for page in PAGES if page.name != "CHANGELOG.md"} <= reached
+
+
+def test_files_that_pages_name_exist():
+    for page in PAGES:
+        for name in re.findall(
+            r"`((?:tests|docs|drivers|model|tracker|recordings)/[\w./]+)`", page.read_text("utf-8")
+        ):
+            assert (ROOT / name).exists(), f"{page.name} names {name}"
+
+
+# Commands -------------------------------------------------------------------------------------------
+
+
+def tool() -> str:
+    """The installed command, as the README's .venv/bin/tonguetrack."""
+    return str(Path(sys.executable).parent / "tonguetrack")
+
+
+@pytest.fixture
+def newcomer(tmp_path):
+    """A folder in which the README's commands can be typed: .venv, and the checkout's sample files."""
+    missing = [name for name in SAMPLES if not (ROOT / name).is_file()]
+    assert not missing, f"the checkout lacks {', '.join(missing)}"
+    (tmp_path / ".venv" / "bin").mkdir(parents=True)
+    (tmp_path / ".venv" / "bin" / "tonguetrack").symlink_to(tool())
+    for name in SAMPLES:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    return tmp_path
+
+
+def typed(command: str, folder: Path) -> subprocess.CompletedProcess:
+    done = subprocess.run(
+        ["bash", "-c", command], cwd=folder, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def run_here(page: Path, table: dict[str, str], folder: Path) -> None:
+    for command in commands(page):
+        if table[command] == HERE:
+            # Real time is for people; the frames are the same without waiting.
+            typed(command.replace(" --realtime", ""), folder)
+
+
+def test_the_readmes_commands_run_one_after_the_other(newcomer):
+    run_here(ROOT / "README.md", README, newcomer)
+    for name in ("poses.csv", "session.toml", "poses.npz", "tongue.ply", "demo.json", "simulated.csv"):
+        assert (newcomer / name).stat().st_size > 100, name
+    (program,) = blocks(ROOT / "README.md", "python")
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=newcomer, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"\(\d+, \d+\) [\d.]+\n", done.stdout)
+
+
+def test_the_docs_commands_run(newcomer):
+    for page in doc_pages():
+        if any(DOCS[command] == HERE for command in commands(page)):
+            if page.name == "tracking.md":
+                typed(f"{tool()} track recordings/demo.csv --out poses.csv", newcomer)
+            run_here(page, DOCS, newcomer)
+
+
+def test_the_docs_programs_run(newcomer):
+    typed(f"{tool()} track recordings/demo.csv --save-session session.toml", newcomer)
+    shutil.copy(newcomer / "model/data/default.npz", newcomer / "ultrax.npz")
+    for page in doc_pages():
+        for program in blocks(page, "python"):
+            if "serve_forever" in program:
+                continue
+            if "model.at([0" in program:  # the bundled model may have another number of speaker weights
+                program = re.sub(r"\[0\.5, .*?\]", "[0.5] + [0] * (model.speaker.size - 1)", program)
+                program = re.sub(r"raw\(\[1, .*?\]", "raw([1] + [0] * (model.pose.size - 1)", program)
+            done = subprocess.run(
+                [sys.executable, "-c", program], cwd=newcomer, capture_output=True, text=True, check=False
+            )
+            assert done.returncode == 0, f"{page.name}\n{program}\n{done.stderr}"
+
+
+def test_the_docs_session_is_a_session(tmp_path):
+    from tonguetrack.tracker import load_session
+    from tonguetrack.tracker.coilmap import ROLES
+
+    (example,) = blocks(ROOT / "docs" / "session.md", "toml")
+    (tmp_path / "example.toml").write_text(example, encoding="utf-8")
+    session = load_session(tmp_path / "example.toml")
+    assert session.speaker_weights is not None and session.alignment.midsagittal
+    text = (ROOT / "docs" / "session.md").read_text(encoding="utf-8")
+    assert [role for role in ROLES if f"`{role}`" not in text] == []
+
+
+def test_the_docs_table_of_axes_is_what_the_tracker_suggests():
+    from tonguetrack.drivers.files import carstens, est, mview, xrmb
+    from tonguetrack.tracker.session import axis_mapping
+    from tonguetrack.tracker.setup import suggested_axes
+
+    text = (ROOT / "docs" / "session.md").read_text(encoding="utf-8")
+    frames = {
+        "AG501 `.pos` after normpos": carstens.NORMPOS_FRAME,
+        "AG500 `.pos` with unit vectors": carstens.VECTOR_FRAME,
+        "MVIEW `.mat`, three-dimensional": mview.FRAME_3D,
+        "MVIEW `.mat`, two-dimensional": mview.FRAME_2D,
+        "X-ray microbeam `.txy`": xrmb.FRAME,
+        "MOCHA `.ema`": est.MOCHA_FRAME,
+    }
+    for words, frame in frames.items():
+        (row,) = re.findall(rf"^\| {re.escape(words)} .*\| (.*) \|$", text, re.MULTILINE)
+        suggested = suggested_axes(frame)
+        assert suggested is not None
+        if (axis_mapping(suggested) == axis_mapping(("x", "y", "z"))).all():
+            assert row == "none needed", words
+        else:
+            assert row == f"`{json.dumps(suggested)}`", words
+
+
+def test_every_format_that_is_read_has_a_row_in_the_docs():
+    from tonguetrack.drivers.files.recognise import FORMATS
+
+    text = (ROOT / "docs" / "recordings.md").read_text(encoding="utf-8")
+    words = {
+        "authors' EMA JSON": "EMA JSON of the authors' programs",
+        "tonguetrack CSV": "our CSV",
+        "tonguetrack .npz": "our `.npz`",
+        "CSV table": "another program's CSV",
+        "Carstens AG50x .pos": "Carstens AG501 (AG50x) `.pos`",
+        "NDI Wave .tsv v1": "NDI Wave `.tsv`, both layouts",
+        "NDI Wave .tsv v2": "NDI Wave `.tsv`, both layouts",
+    }
+    for form in FORMATS:
+        named = words.get(form.words, re.sub(r"(\.\w+)", r"`\1`", form.words))
+        assert f"| {named}" in text, form.words
+
+
+def test_the_demo_arrives_at_the_monitor(newcomer):
+    """The README's monitor, for a shorter time and on a free port, while the demo runs at full speed."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    monitor = subprocess.Popen(
+        [tool(), "monitor", "--listen", f"127.0.0.1:{port}", "--seconds", "20", "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert monitor.stderr is not None and monitor.stdout is not None
+    limit = threading.Timer(60, monitor.kill)
+    limit.start()
+    try:
+        assert "listening" in monitor.stderr.readline()
+        typed(f"{tool()} demo --osc 127.0.0.1:{port} --seconds 2", newcomer)
+        monitor.send_signal(2)  # Ctrl-C: the monitor ends with its summary
+        printed = monitor.stdout.read()
+        assert monitor.wait(30) == 0
+    finally:
+        limit.cancel()
+        monitor.kill()
+        monitor.stderr.close()
+        monitor.stdout.close()
+    assert '"/tongue/pose"' in printed
+
+
+def test_three_commands_track_a_real_recording_with_real_tongues(reference_data, tmp_path):
+    (tmp_path / ".venv" / "bin").mkdir(parents=True)
+    (tmp_path / ".venv" / "bin" / "tonguetrack").symlink_to(tool())
+    places = {"PATH/sampleDatabase.yaml": reference_data / "ultrax-tongue-meshes" / "sampleDatabase.yaml",
+              "PATH/emu_webapp": reference_data / "recordings" / "emu_webapp"}  # fmt: skip
+    everything = [*commands(ROOT / "README.md"), *commands(*doc_pages())]
+    chosen = [c for c in dict.fromkeys(everything) if {**README, **DOCS}[c] == WITH_REFERENCE]
+    assert len(chosen) == 4
+    printed = {}
+    for command in chosen:
+        real = command
+        for placeholder, place in places.items():
+            real = real.replace(placeholder, f"'{place}'")
+        assert "PATH" not in real
+        printed[command.split()[2] + " " + command.split()[1]] = typed(real, tmp_path)
+    rows = [line for line in (tmp_path / "poses.csv").read_text().splitlines() if not line.startswith("#")]
+    assert len(rows) == 1 + 800
+    header = rows[0].split(",")
+    assert {"pose_4", "speaker_5", "residual_mm", "tongue_tip_z_mm"} <= set(header)
+    residual = [row.split(",")[header.index("residual_mm")] for row in rows[1:]]
+    tracked = [float(cell) for cell in residual if cell]
+    assert len(tracked) == 760 and sum(tracked) / len(tracked) < 2.5
+    # What docs/model.md quotes is what the command prints.
+    page = (ROOT / "docs" / "model.md").read_text(encoding="utf-8")
+    for line in printed["info model"].stdout.splitlines():
+        if line.strip().startswith("compactness"):
+            assert line.strip() in page
+    assert (tmp_path / "ultrax.yaml").is_file()
