@@ -31,7 +31,9 @@ def tongue_surface(anatomy: Anatomy, articulation: Articulation) -> FloatArray:
     pressed against teeth, palate and pharyngeal wall without crossing them.
     """
     template = tongue_template()
-    return _pressed_against_walls(_swept(anatomy, articulation, template), anatomy)
+    behind_tip = _plateau(template.s - template.tip_s, 8.0, 200.0, 3.0)
+    groove = np.repeat(_groove_depth(anatomy, articulation, template) * behind_tip, len(template.theta))
+    return _pressed_against_walls(_swept(anatomy, articulation, template), anatomy, groove)
 
 
 def enclosed_volume(vertices: FloatArray) -> float:
@@ -119,8 +121,7 @@ def _swept_unscaled(anatomy: Anatomy, articulation: Articulation, template: Tong
     drop = depth[:, None] * (1.0 - np.cos(theta))[None, :]
     pressed_side = np.exp(-0.5 * ((np.abs(template.theta) - 58.0) / 20.0) ** 2)[None, :]
     drop -= size * a.brace_mm * _plateau(s, 8.0, 56.0, 9.0)[:, None] * pressed_side
-    groove = size * a.groove_mm * _bell(s, 6.0 + 60.0 * a.groove_place, 11.0)
-    groove += 0.3 * size * _plateau(s, 8.0, 60.0, 8.0)
+    groove = _groove_depth(anatomy, a, template)
     drop += groove[:, None] * np.exp(-0.5 * (x / (4.2 * size)) ** 2)
     drop -= size * a.tilt_mm * _plateau(s, -10.0, 60.0, 10.0)[:, None] * sine
     y = contour[:, 0, None] - drop * normal[:, 0, None]
@@ -128,10 +129,19 @@ def _swept_unscaled(anatomy: Anatomy, articulation: Articulation, template: Tong
     return np.stack([x, y, z], axis=2).reshape(-1, 3)
 
 
-def _pressed_against_walls(vertices: FloatArray, anatomy: Anatomy) -> FloatArray:
+def _groove_depth(anatomy: Anatomy, articulation: Articulation, template: TongueTemplate) -> FloatArray:
+    """(rows,) mm: depth of the midline groove along the contour."""
+    s = template.s - template.tip_s
+    deepest = 6.0 + 60.0 * articulation.groove_place
+    groove = articulation.groove_mm * _bell(s, deepest, 11.0) + 0.3 * _plateau(s, 8.0, 60.0, 8.0)
+    return np.asarray(anatomy.size * groove)
+
+
+def _pressed_against_walls(vertices: FloatArray, anatomy: Anatomy, groove: FloatArray) -> FloatArray:
     """The surface inside teeth, palate and pharyngeal wall, following them where it would cross.
 
-    Teeth stand beside the tongue only above the edge of the palate.
+    Teeth stand beside the tongue only above the edge of the palate. Along the middle the palate is kept at
+    a distance, more so where the tongue is grooved, or pressing would iron the groove out. groove: (n,) mm.
     """
     pressed = vertices.copy()
     between_teeth = _plateau(vertices[:, 2], -7.0 * anatomy.size, 60.0, 3.0) * _plateau(
@@ -139,7 +149,7 @@ def _pressed_against_walls(vertices: FloatArray, anatomy: Anatomy) -> FloatArray
     )
     beside = 0.97 * anatomy.arch_half_width(vertices[:, 1]) - np.abs(vertices[:, 0])
     pressed[:, 0] -= np.sign(vertices[:, 0]) * (_soft_positive(beside) - beside) * between_teeth
-    channel = AIR_CHANNEL_MM * np.exp(-0.5 * (vertices[:, 0] / (6.0 * anatomy.size)) ** 2)
+    channel = (AIR_CHANNEL_MM + groove) * np.exp(-0.5 * (vertices[:, 0] / (4.2 * anatomy.size)) ** 2)
     room = anatomy.palate_z(pressed[:, 0], vertices[:, 1]) - channel - vertices[:, 2]
     under_palate = _plateau(vertices[:, 1], -7.0, 72.0 * anatomy.size * anatomy.mouth, 2.5)
     pressed[:, 2] -= (_soft_positive(room) - room) * under_palate
