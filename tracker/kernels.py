@@ -30,9 +30,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-# A step is the last one when it promises to lower the energy by less than this share of it. One more
-# Newton step from there gains its square, far below what float64 can show.
+# Division by zero gives inf instead of raising, which spares a test in every division.
+OPTIONS = {"cache": True, "inline": "never", "error_model": "numpy"}
+
+# A step is the last one when it promises to lower the energy by less than this share of it. An exact Newton
+# step leaves about the square of what it promised, so it may promise more.
 RELATIVE_DECREASE = 1e-12
+EXACT_NEWTON_DECREASE = 1e-7
 MAX_NEWTON_STEPS = 100
 MAX_ACTIVE_SET_STEPS = 200
 # Gauss-Newton is cheap far from the minimum, but only linear near it where residuals are large.
@@ -58,7 +62,7 @@ def free_scratch(speaker_size: int, pose_size: int, coils: int) -> tuple[np.ndar
     return np.zeros((3 * size + 14, size)), np.zeros((size + 3, 3 * coils))
 
 
-@njit(cache=True, inline="never")
+@njit(**OPTIONS)
 def minimise_quadratic_in_box(hessian, linear, low, high, x, scratch):
     """Minimises 1/2 x'Hx - linear'x over the box, from x, in place.
 
@@ -170,7 +174,7 @@ def minimise_quadratic_in_box(hessian, linear, low, high, x, scratch):
     return SOLVED
 
 
-@njit(cache=True, inline="never")
+@njit(**OPTIONS)
 def coil_residuals(coils, base, directions, weights, residuals):
     """residuals (n,): distance in mm of each coil from its vertex, NaN where the coil is missing.
     Returns their mean over the present coils (NaN without any)."""
@@ -194,7 +198,7 @@ def coil_residuals(coils, base, directions, weights, residuals):
     return total / present if present > 0 else np.nan
 
 
-@njit(cache=True, inline="never")
+@njit(**OPTIONS)
 def coil_grams(directions, gram):
     """gram (n, K, K): the products of the directions at each coil, constant for a fixed speaker."""
     size = directions.shape[0]
@@ -207,7 +211,7 @@ def coil_grams(directions, gram):
                 gram[i, a, b] = total
 
 
-@njit(cache=True, inline="never")
+@njit(**OPTIONS)
 def solve_fixed_speaker(
     coils, base, directions, gram, box, energy, coherent, weights, residuals, scratch, result
 ):
@@ -279,7 +283,7 @@ def solve_fixed_speaker(
     return STATUS_OK
 
 
-@njit(cache=True, inline="never")
+@njit(**OPTIONS)
 def _jacobian_and_residual(coils, base, core, weights, jacobian, residual):
     """jacobian (m + n, 3n): d v / d weight; residual (3n,): v - q. Rows of missing coils are zero."""
     speakers, poses, rows = core.shape
@@ -294,8 +298,9 @@ def _jacobian_and_residual(coils, base, core, weights, jacobian, residual):
                 value = core[l, k, row]
                 jacobian[l, row] += pose_weight * value
                 jacobian[speakers + k, row] += speaker_weight * value
-    for row in range(rows):
-        residual[row] = base[row] - coils[row // 3, row % 3]
+    for i in range(coils.shape[0]):
+        for axis in range(3):
+            residual[3 * i + axis] = base[3 * i + axis] - coils[i, axis]
     for l in range(speakers):
         for row in range(rows):
             residual[row] += weights[l] * jacobian[l, row]
@@ -307,7 +312,7 @@ def _jacobian_and_residual(coils, base, core, weights, jacobian, residual):
                     jacobian[a, row] = 0.0
 
 
-@njit(cache=True, inline="never")
+@njit(**OPTIONS)
 def free_energy(coils, base, core, box, alpha, beta, gamma, previous, weights, jacobian, residual):
     """E at `weights`; leaves the Jacobian and the residual of that point behind. beta, gamma: (m + n,)."""
     _jacobian_and_residual(coils, base, core, weights, jacobian, residual)
@@ -326,7 +331,7 @@ def free_energy(coils, base, core, box, alpha, beta, gamma, previous, weights, j
     return total
 
 
-@njit(cache=True, inline="never")
+@njit(**OPTIONS)
 def free_gradient_and_hessian(
     coils, core, box, alpha, beta, gamma, previous, weights, jacobian, residual, exact, gradient, hessian
 ):
@@ -363,7 +368,7 @@ def free_gradient_and_hessian(
             hessian[b, a] = hessian[a, b]
 
 
-@njit(cache=True, inline="never")
+@njit(**OPTIONS)
 def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scratch, coil_scratch):
     """Minimises E over the box from `weights`, in place. Returns E at the minimiser."""
     size = weights.shape[0]
@@ -527,14 +532,15 @@ def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scra
         for a in range(size):
             moved = target[a] if length == 1.0 else weights[a] + length * (target[a] - weights[a])
             weights[a] = min(max(moved, box[1, a]), box[2, a])
-        if stationary_if_small and promised <= RELATIVE_DECREASE * energy + 1e-24:
+        enough = EXACT_NEWTON_DECREASE if exact and shift == 0.0 else RELATIVE_DECREASE
+        if stationary_if_small and promised <= enough * energy + 1e-24:
             return energy + change
         if not exact and -change < 0.25 * promised:
             gauss_newton_steps = 0
     return free_energy(coils, base, core, box, alpha, beta, gamma, previous, weights, jacobian, residual)
 
 
-@njit(cache=True, inline="never")
+@njit(**OPTIONS)
 def solve_free_speaker(
     coils, base, core, box, energy, coherent, restart, weights, residuals, scratch, coil_scratch, result
 ):
@@ -597,7 +603,7 @@ def solve_free_speaker(
     return STATUS_OK if present > 0 else STATUS_HELD
 
 
-@njit(cache=True, inline="never")
+@njit(**OPTIONS)
 def prepare_frame(raw, picked, rotation, translation, project, coils):
     """coils (n, 3) in the model frame from a source's raw (all coils, 3).
 
@@ -621,14 +627,14 @@ def prepare_frame(raw, picked, rotation, translation, project, coils):
             coils[i, 0] = 0.0
 
 
-@njit(cache=True)
+@njit(**OPTIONS)
 def prepare_frames(raw, picked, rotation, translation, project, coils):
     """`prepare_frame` for raw (frames, all coils, 3) into coils (frames, n, 3)."""
     for frame in range(raw.shape[0]):
         prepare_frame(raw[frame], picked, rotation, translation, project, coils[frame])
 
 
-@njit(cache=True)
+@njit(**OPTIONS)
 def track_fixed_speaker(
     coils,
     base,
@@ -660,7 +666,7 @@ def track_fixed_speaker(
             tracked[frame, a] = weights[a]
 
 
-@njit(cache=True)
+@njit(**OPTIONS)
 def track_free_speaker(
     coils,
     base,

@@ -149,13 +149,14 @@ def _track_one(
         print(f"  written: {args.save_session}", file=sys.stderr)
     if args.osc:
         from ..live import stream_recording
+        from .watching import watched
 
         setup = run.setup
         if args.experiment == "1":
             setup = replace(setup, session=replace(setup.session, speaker_weights=None))
-        report["stream"] = stream_recording(
-            recording, model, setup, destination=args.osc, realtime=args.realtime
-        ).as_dict()
+        stream = stream_recording(recording, model, setup, args.osc, realtime=args.realtime, watch=watched)
+        print(stream, file=sys.stderr)
+        report["stream"] = stream.as_dict()
     if not job.outputs and not args.osc:
         print("  nothing was written; add --out poses.csv or --osc HOST:PORT", file=sys.stderr)
     return report
