@@ -27,11 +27,13 @@ compiled while frames arrive.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
 # Division by zero gives inf instead of raising, which spares a test in every division.
-OPTIONS = {"cache": True, "inline": "never", "error_model": "numpy"}
+OPTIONS: dict[str, Any] = {"cache": True, "inline": "never", "error_model": "numpy"}
 
 # A step is the last one when it promises to lower the energy by less than this share of it. An exact Newton
 # step leaves about the square of what it promised, so it may promise more.

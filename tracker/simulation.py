@@ -215,7 +215,7 @@ def write_simulation(simulation: Simulation, path: str | Path) -> tuple[Path, Pa
 def _phone_sequence(simulation: Simulation) -> tuple[tuple[str, ...], FloatArray]:
     count = max(1, int(np.ceil(simulation.length_s / simulation.phone_s - 1e-9)))
     phones = tuple(simulation.phones[index % len(simulation.phones)] for index in range(count))
-    return phones, np.arange(count + 1) * simulation.phone_s
+    return phones, np.asarray(np.arange(count + 1) * simulation.phone_s, dtype=np.float64)
 
 
 def _articulation_at(time_s: float, targets: list[Articulation], phone_s: float) -> Articulation:

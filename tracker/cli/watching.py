@@ -27,7 +27,9 @@ def announced_compilation() -> Iterator[None]:
     from .. import kernels
 
     def announce() -> None:
-        _say("preparing the solver; the first time on this machine it is compiled, which takes some seconds ...")
+        _say(
+            "preparing the solver; the first time on this machine it is compiled, which takes some seconds ..."
+        )
 
     def misses() -> int:
         dispatchers = (kernels.prepare_frame, kernels.solve_fixed_speaker, kernels.solve_free_speaker)
