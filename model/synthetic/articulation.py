@@ -59,8 +59,8 @@ class Habits:
 
 # Sustained phones; the vowels by height and place, the sibilants by constriction.
 PHONES: Mapping[str, Articulation] = {
-    "i": Articulation(1.5, 5.0, 3.2, 4.2, 0.34, 8.0, 0.5, 1.5, 2.0, 0.9, 0.75, 5.0, 0.25),
-    "e": Articulation(3.5, 4.0, 2.2, 3.0, 0.36, 5.5, 0.5, 1.0, 1.5, 0.8, 0.7, 3.5, 0.2),
+    "i": Articulation(1.5, 5.0, 3.2, 4.2, 0.34, 8.0, 0.5, 1.5, 2.0, 0.9, 0.75, 5.5, 0.25),
+    "e": Articulation(3.5, 4.0, 2.2, 3.0, 0.36, 5.5, 0.5, 1.0, 1.5, 0.8, 0.7, 5.0, 0.2),
     "ɛ": Articulation(6.0, 3.0, 1.5, 2.0, 0.40, 3.0, 1.0, 1.0, 1.0, 0.7, 0.6, 1.5, 0.15),
     "a": Articulation(9.0, 1.0, -1.0, 0.0, 0.50, -1.0, 1.0, -1.0, -0.5, 0.7, 0.5, 0.0, 0.2),
     "ɑ": Articulation(9.0, -6.5, -3.0, 1.0, 0.85, -7.0, -4.0, -2.0, -1.5, 0.6, 0.5, -0.5, 0.1),
@@ -70,8 +70,8 @@ PHONES: Mapping[str, Articulation] = {
     "u": Articulation(2.5, -4.0, 3.5, 6.0, 0.70, 2.5, -6.0, 0.0, 0.5, 0.5, 0.8, 2.5, 0.0),
     "ʉ": Articulation(2.0, 1.5, 2.8, 4.6, 0.50, 6.0, -2.0, 1.5, 2.0, 0.7, 0.7, 3.5, 0.1),
     "ə": Articulation(4.0, 0.0, 0.0, 0.5, 0.50, 0.0, 0.0, 0.0, 0.0, 0.6, 0.5, 0.5, 0.1),
-    "s": Articulation(1.0, 1.5, 0.5, -1.5, 0.50, 1.5, 1.0, 6.0, 4.0, 3.6, 0.16, 5.0, 0.45),
-    "ʃ": Articulation(1.5, -1.0, 2.5, 2.5, 0.34, 3.0, -3.5, 6.0, 6.0, 3.6, 0.24, 5.0, 0.35),
+    "s": Articulation(1.0, 1.5, 0.5, -1.5, 0.50, 1.5, 1.0, 5.0, 4.0, 3.8, 0.18, 7.0, 0.45),
+    "ʃ": Articulation(1.5, -1.0, 2.5, 2.5, 0.34, 3.0, -3.5, 6.0, 6.0, 3.8, 0.26, 6.5, 0.35),
 }
 SCATTER = Articulation(0.8, 1.4, 1.1, 1.0, 0.05, 1.7, 1.3, 1.3, 0.8, 0.2, 0.03, 0.6, 0.07, 0.2)
 
@@ -116,7 +116,7 @@ def articulation_for(anatomy: Anatomy, phone: str, habits: Habits) -> Articulati
         values["arch_place"] += habits.arch_shift
     if phone in ("s", "ʃ"):
         apical = 1.0 - 2.0 * habits.laminal  # +1 apical .. -1 laminal
-        values["tip_up_mm"] += 1.8 * apical
+        values["tip_up_mm"] += 1.2 * apical
         values["blade_up_mm"] -= 1.2 * apical
         values["tip_front_mm"] += 0.8 * apical
         values["groove_mm"] += 0.5 * apical

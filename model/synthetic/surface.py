@@ -15,11 +15,14 @@ FloatArray = NDArray[np.float64]
 
 HINGE = np.array([88.0, 42.0])  # (y, z) mm of the jaw's axis, reference speaker
 REST_JAW_DEG = 4.0  # the neutral contour holds the jaw of a schwa
-# Half width and depth of the cross-section (mm) at places along the contour, mm from the tip: narrow and
-# thin at the tip, wide and deep at the dorsum.
+# Cross-section at places along the contour (mm from the tip): half width in mm, and how flat its top is.
+# Narrow and flat at the tip, wide and rounder at the dorsum.
 PLACES = np.array([-30.0, -22.0, -12.0, -6.0, 0.0, 5.0, 12.0, 24.0, 38.0, 52.0, 66.0, 80.0, 110.0])
-HALF_WIDTHS = np.array([15.0, 14.0, 12.5, 11.5, 10.5, 12.5, 16.0, 21.0, 23.5, 23.0, 20.0, 18.0, 17.0])
-DEPTHS = np.array([4.0, 3.4, 2.8, 2.6, 2.8, 3.4, 6.0, 11.5, 15.0, 15.0, 12.0, 9.0, 7.5])
+HALF_WIDTHS = np.array([16.0, 15.0, 13.0, 12.0, 11.0, 13.0, 16.5, 21.0, 23.5, 23.0, 20.0, 18.0, 17.0])
+FLATNESSES = np.array([1.7, 1.8, 2.1, 2.3, 2.4, 2.3, 2.0, 1.8, 1.65, 1.6, 1.6, 1.5, 1.4])
+# The open base: a straight line from behind the first row to before the last, in the sagittal plane.
+BASE_BEHIND_FRONT_MM = np.array([5.0, -2.0])
+BASE_BEFORE_ROOT_MM = np.array([-11.0, -2.0])
 AIR_CHANNEL_MM = 1.2  # the phones are vowels and sibilants: air passes along the middle
 CONTACT_SHARPNESS = 2.2  # 1/mm: how closely the surface follows what it touches
 
@@ -31,8 +34,7 @@ def tongue_surface(anatomy: Anatomy, articulation: Articulation) -> FloatArray:
     pressed against teeth, palate and pharyngeal wall without crossing them.
     """
     template = tongue_template()
-    behind_tip = _plateau(template.s - template.tip_s, 8.0, 200.0, 3.0)
-    groove = np.repeat(_groove_depth(anatomy, articulation, template) * behind_tip, len(template.theta))
+    groove = np.repeat(_groove_depth(anatomy, articulation, template), len(template.theta))
     return _pressed_against_walls(_swept(anatomy, articulation, template), anatomy, groove)
 
 
@@ -113,20 +115,33 @@ def _swept_unscaled(anatomy: Anatomy, articulation: Articulation, template: Tong
     s = template.s - template.tip_s
     theta = np.radians(template.theta)
     contour = _contour(anatomy, a, template)
-    normal = _normals(contour)
     sine = np.sin(theta)[None, :]
     half_width = size * anatomy.width * _smooth(np.interp(s, PLACES, HALF_WIDTHS))
-    depth = size * _smooth(np.interp(s, PLACES, DEPTHS)) * (1.0 - 0.45 * a.flat * _plateau(s, 0.0, 60.0, 8.0))
     x = half_width[:, None] * sine
-    drop = depth[:, None] * (1.0 - np.cos(theta))[None, :]
-    pressed_side = np.exp(-0.5 * ((np.abs(template.theta) - 58.0) / 20.0) ** 2)[None, :]
+    # In the sagittal plane every row runs straight from the contour to its place on the base.
+    start, end = contour[0] + size * BASE_BEHIND_FRONT_MM, contour[-1] + size * BASE_BEFORE_ROOT_MM
+    share = _base_share(s)
+    to_base = start + share[:, None] * (end - start) - contour
+    length = np.linalg.norm(to_base, axis=1)
+    to_base /= length[:, None]
+    flatness = _smooth(np.interp(s, PLACES, FLATNESSES)) + 0.8 * a.flat * _plateau(s, 0.0, 60.0, 8.0)
+    drop = length[:, None] * (1.0 - np.cos(theta))[None, :] ** flatness[:, None]
+    pressed_side = np.exp(-0.5 * ((np.abs(template.theta) - 50.0) / 14.0) ** 2)[None, :]
     drop -= size * a.brace_mm * _plateau(s, 8.0, 56.0, 9.0)[:, None] * pressed_side
     groove = _groove_depth(anatomy, a, template)
     drop += groove[:, None] * np.exp(-0.5 * (x / (4.2 * size)) ** 2)
-    drop -= size * a.tilt_mm * _plateau(s, -10.0, 60.0, 10.0)[:, None] * sine
-    y = contour[:, 0, None] - drop * normal[:, 0, None]
-    z = contour[:, 1, None] - drop * normal[:, 1, None]
+    drop -= size * a.tilt_mm * _plateau(s, -10.0, 60.0, 10.0)[:, None] * sine * np.cos(theta)[None, :]
+    y = contour[:, 0, None] + drop * to_base[:, 0, None]
+    z = contour[:, 1, None] + drop * to_base[:, 1, None]
     return np.stack([x, y, z], axis=2).reshape(-1, 3)
+
+
+def _base_share(s: FloatArray) -> FloatArray:
+    """(rows,) 0 .. 1 along the base: the underside and the tip keep to its front, the root to its end."""
+    places = np.array([-30.0, -22.0, 0.0, 12.0, 24.0, 40.0, 56.0, 72.0, 90.0, 110.0])
+    shares = np.array([0.0, 0.03, 0.10, 0.16, 0.25, 0.42, 0.62, 0.80, 0.94, 1.0])
+    share = _smooth(np.interp(s, places, shares))
+    return np.asarray((share - share[0]) / (share[-1] - share[0]))
 
 
 def _groove_depth(anatomy: Anatomy, articulation: Articulation, template: TongueTemplate) -> FloatArray:
@@ -134,7 +149,7 @@ def _groove_depth(anatomy: Anatomy, articulation: Articulation, template: Tongue
     s = template.s - template.tip_s
     deepest = 6.0 + 60.0 * articulation.groove_place
     groove = articulation.groove_mm * _bell(s, deepest, 11.0) + 0.3 * _plateau(s, 8.0, 60.0, 8.0)
-    return np.asarray(anatomy.size * groove)
+    return np.asarray(anatomy.size * groove * _plateau(s, 8.0, 200.0, 3.0))  # the tip is too thin for one
 
 
 def _pressed_against_walls(vertices: FloatArray, anatomy: Anatomy, groove: FloatArray) -> FloatArray:

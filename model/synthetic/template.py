@@ -37,13 +37,15 @@ CONTROL_POINTS = np.array(
     ]
 )
 ROWS = 69
-COLUMNS = 47
-WIDEST_ANGLE = 100.0
+COLUMNS = 49
+# Columns stand at equal arc lengths of this cross-section: half width and depth in mm, flatness.
+REFERENCE_SECTION = (23.0, 34.0, 1.65)
 TIP_REACH_MM = 5.0
 BLADE_REACH_MM = 18.0
 DORSUM_REACH_MM = 48.0
 BACK_REACH_MM = 78.0
-SIDE_ANGLE = 52.0
+SIDE_ANGLE = 50.0
+LOWEST_SIDE_ANGLE = 78.0
 
 
 @dataclass(frozen=True)
@@ -75,9 +77,8 @@ def tongue_template() -> TongueTemplate:
     basis, s = _rows_evenly_spaced()
     contour = basis @ CONTROL_POINTS
     tip_row = int(np.argmin(contour[:, 0]))
-    theta = np.linspace(-WIDEST_ANGLE, WIDEST_ANGLE, COLUMNS)
+    theta = _columns_evenly_spaced()
     middle = COLUMNS // 2
-    theta[middle] = 0.0
     grid = np.arange(ROWS * COLUMNS).reshape(ROWS, COLUMNS)
     beyond_tip = s - s[tip_row]
     regions = _regions(grid, beyond_tip, theta)
@@ -85,7 +86,7 @@ def tongue_template() -> TongueTemplate:
     def at(distance_mm: float, column: int = middle) -> int:
         return int(grid[int(np.argmin(np.abs(beyond_tip - distance_mm))), column])
 
-    quarter = int(np.argmin(np.abs(theta - 70.0)))
+    quarter = int(np.argmin(np.abs(theta - 60.0)))
     landmarks = {
         "Tip": int(grid[tip_row, middle]),
         "SurfaceCenter": at(33.0),
@@ -126,6 +127,16 @@ def _rows_evenly_spaced() -> tuple[FloatArray, FloatArray]:
     return rows, s
 
 
+def _columns_evenly_spaced() -> FloatArray:
+    """(columns,) degrees from -90 to 90, symmetric, at equal arc lengths of the reference section."""
+    half_width, depth, flatness = REFERENCE_SECTION
+    dense = np.radians(np.linspace(0.0, 90.0, 2001))
+    section = np.column_stack([half_width * np.sin(dense), depth * (1.0 - np.cos(dense)) ** flatness])
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(section, axis=0), axis=1))])
+    half = np.degrees(np.interp(np.linspace(0.0, length[-1], COLUMNS // 2 + 1), length, dense))
+    return np.concatenate([-half[:0:-1], half])
+
+
 def _faces(grid: NDArray[np.intp]) -> IndexArray:
     """Two triangles a cell, their diagonals mirrored in the mid-sagittal plane, outward by the right hand."""
     faces = []
@@ -144,7 +155,7 @@ def _faces(grid: NDArray[np.intp]) -> IndexArray:
 def _regions(grid: NDArray[np.intp], beyond_tip: FloatArray, theta: FloatArray) -> dict[str, tuple[int, ...]]:
     """The speech-related regions on the upper surface, by distance from the tip and by angle."""
     upper = np.abs(theta) <= SIDE_ANGLE
-    side = (np.abs(theta) > SIDE_ANGLE) & (np.abs(theta) <= 85.0)
+    side = (np.abs(theta) > SIDE_ANGLE) & (np.abs(theta) <= LOWEST_SIDE_ANGLE)
 
     def pick(low: float, high: float, columns: NDArray[np.bool_]) -> tuple[int, ...]:
         rows = (beyond_tip >= low) & (beyond_tip < high)
