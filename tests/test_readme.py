@@ -12,6 +12,8 @@ import socket
 import subprocess
 import sys
 import threading
+import zipfile
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -199,6 +201,15 @@ def test_the_readmes_commands_run_one_after_the_other(newcomer):
     run_here(ROOT / "README.md", README, newcomer)
     for name in ("poses.csv", "session.toml", "poses.npz", "tongue.ply", "demo.json", "simulated.csv"):
         assert (newcomer / name).stat().st_size > 100, name
+    documented = (ROOT / "docs" / "tracking.md").read_text(encoding="utf-8")
+    header = next(line for line in (newcomer / "poses.csv").read_text().splitlines() if line[0] != "#")
+    for column in header.split(","):
+        general = re.sub(r"tongue_(tip|blade|dorsum)", "ROLE", column)
+        general = re.sub(r"^(pose|speaker)_\d+", r"\1_1", general)
+        assert f"`{general}`" in documented, column
+    with zipfile.ZipFile(newcomer / "poses.npz") as archive:
+        for name in archive.namelist():
+            assert f"`{name.removesuffix('.npy')}`" in documented, name
     (program,) = blocks(ROOT / "README.md", "python")
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=newcomer, capture_output=True, text=True, check=False
@@ -234,12 +245,16 @@ def test_the_docs_programs_run(newcomer):
 def test_the_docs_session_is_a_session(tmp_path):
     from tonguetrack.tracker import load_session
     from tonguetrack.tracker.coilmap import ROLES
+    from tonguetrack.tracker.session import Energy
 
     (example,) = blocks(ROOT / "docs" / "session.md", "toml")
     (tmp_path / "example.toml").write_text(example, encoding="utf-8")
     session = load_session(tmp_path / "example.toml")
     assert session.speaker_weights is not None and session.alignment.midsagittal
     text = (ROOT / "docs" / "session.md").read_text(encoding="utf-8")
+    rows = "".join(re.findall(r"^\| .*\n", text, re.MULTILINE))
+    for energy in fields(Energy):
+        assert f"`{energy.name}`" in rows and getattr(session.energy, energy.name) == energy.default
     assert [role for role in ROLES if f"`{role}`" not in text] == []
 
 
