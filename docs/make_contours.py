@@ -32,7 +32,9 @@ def main() -> None:
     handles, names = axes.flat[0].get_legend_handles_labels()
     axes.flat[-1].axis("off")
     axes.flat[-1].legend(handles, names, ncol=3, loc="center", frameon=False)
-    figure.suptitle("Synthetic speakers (not anatomy): 13 phones each, palate in black; mm, front to the left")
+    figure.suptitle(
+        "Synthetic speakers (not anatomy): 13 phones each, palate in black; mm, front to the left"
+    )
     figure.tight_layout()
     figure.savefig(TARGET, dpi=70)
     print(f"{TARGET}: {TARGET.stat().st_size} bytes")

@@ -1,4 +1,4 @@
-"""Draws docs/overview.png, the README's picture, from the bundled model and recording (needs matplotlib).
+"""Draws docs/overview.png, the README's picture, from the bundled model and recording (needs the extra `plot`).
 
 python docs/make_overview.py
 """
