@@ -3,7 +3,11 @@
 import os
 from pathlib import Path
 
-import pytest
+# Several workers on few cores: the linear algebra library's own threads only get in each other's way.
+for _library in ("OPENBLAS", "OMP", "MKL"):
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+
+import pytest  # noqa: E402 - numpy reads the variables above when it is first imported
 
 NOWHERE = "the reference data are not there: set TONGUETRACK_REFERENCE_DATA to their folder"
 
