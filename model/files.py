@@ -60,8 +60,17 @@ def load_model(path: str | Path) -> TongueModel:
         ) from reason
 
 
+def check_model_suffix(path: str | Path) -> None:
+    """Raises InputError for a name that `save_model` could not write."""
+    if Path(path).suffix.lower() not in MODEL_SUFFIXES:
+        raise InputError(
+            f"{path}: a model is saved as one of {', '.join(MODEL_SUFFIXES)}; end the name in one."
+        )
+
+
 def save_model(model: TongueModel, path: str | Path) -> None:
     """Saves to the format that the suffix names; the file appears whole or not at all."""
+    check_model_suffix(path)
     write_atomically(path, model_bytes(model, Path(path).suffix))
 
 

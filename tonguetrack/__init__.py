@@ -28,6 +28,7 @@ _HOME_OF = {
     "Session": "tracker",
     "TrackedPose": "tracker",
     "Tracker": "tracker",
+    "load_session": "tracker",
     "track_recording": "tracker",
 }
 
@@ -42,6 +43,7 @@ __all__ = [
     "Tracker",
     "__version__",
     "load_model",
+    "load_session",
     "open_recording",
     "save_model",
     "track_recording",

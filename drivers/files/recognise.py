@@ -158,6 +158,8 @@ def _what_else(head: Head, name: str) -> str:
         )
     if "CoreTensor" in head.text or '"ShapeSpace"' in head.text or "TruncatedSpeakerMode" in head.text:
         return "this is a tongue model, not a recording; use `tonguetrack model info`"
+    if "speakerAmount" in head.text:
+        return "this is a sample database of meshes, not a recording; use `tonguetrack model build`"
     if head.text.lstrip().startswith(("{", "[")):
         return 'JSON without "channels", so not the authors\' EMA format'
     cells = head.lines[0].replace(",", " ").split() if head.lines else []

@@ -34,7 +34,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     build.set_defaults(run=run_build)
 
     info = verbs.add_parser("info", help="dimensions, compactness and provenance of a model")
-    info.add_argument("model", metavar="MODEL")
+    info.add_argument("model", metavar="MODEL", help="a model file, or 'bundled'")
     info.add_argument("--json", action="store_true", help="as one JSON object")
     info.set_defaults(run=run_info)
 
@@ -54,9 +54,12 @@ def run_build(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from ...model.build import load_training_shapes, model_from_shapes, read_sample_database
-    from ...model.files import model_bytes, save_model
+    from ...model.files import check_model_suffix, save_model
     from ...model.tensor import cumulative_compactness
+    from .names import prepare_folder
 
+    check_model_suffix(args.output)
+    prepare_folder(Path(args.output))
     database = read_sample_database(args.samples)
     cells = sum(len(phones) for phones in database.paths.values())
     print(
@@ -80,7 +83,7 @@ def run_build(args: argparse.Namespace) -> int:
         for mode, name in ((model.speaker, "speaker"), (model.pose, "pose"))
         if mode.spectrum is not None
     ]
-    size = len(model_bytes(model, Path(args.output).suffix))
+    size = Path(args.output).stat().st_size
     print(
         f"{args.output}: {model.vertex_count} vertices, {', '.join(kept)}, {size / 1e6:.1f} MB",
         file=sys.stderr,
@@ -89,9 +92,9 @@ def run_build(args: argparse.Namespace) -> int:
 
 
 def run_info(args: argparse.Namespace) -> int:
-    from ...model.files import load_model
+    from .names import named_model
 
-    description = describe_model(load_model(args.model), args.model)
+    description = describe_model(named_model(args.model), args.model)
     if args.json:
         print(json.dumps(description, ensure_ascii=False))
     else:
@@ -102,9 +105,11 @@ def run_info(args: argparse.Namespace) -> int:
 def run_convert(args: argparse.Namespace) -> int:
     from pathlib import Path
 
-    from ...model.files import load_model, save_model
+    from ...model.files import check_model_suffix, save_model
+    from .names import named_model
 
-    model = load_model(args.source)
+    check_model_suffix(args.target)
+    model = named_model(args.source)
     save_model(model, args.target)
     if Path(args.source).suffix.lower() == ".npz" and Path(args.target).suffix.lower() != ".npz":
         print(
@@ -124,7 +129,10 @@ def run_synthetic(args: argparse.Namespace) -> int:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: expected an absent or empty folder, so that nothing is overwritten.")
     database = write_samples(folder)
-    print(f"{database}: synthetic speakers; build with 'tonguetrack model build {database}'", file=sys.stderr)
+    print(
+        f"{database}: synthetic speakers; build with 'tonguetrack model build {database} -o model.npz'",
+        file=sys.stderr,
+    )
     return 0
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ... import InputError
+from .names import BUNDLED, named_model, prepare_folder
 
 if TYPE_CHECKING:
     from ...drivers.frames import Recording
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from ..pose import TrackedPoses
     from ..session import Session
     from ..tracking import TrackingRun
-
-BUNDLED = "bundled"
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -99,9 +97,7 @@ def run_track(args: argparse.Namespace) -> int:
     for path, reason in left_out:
         print(f"left out: {path}: {reason}", file=sys.stderr)
     for file in (output for job in jobs for output in job.outputs.values()):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        if not os.access(file.parent, os.W_OK):  # known before the work is done, not after
-            raise InputError(f"{file}: no permission to write in {file.parent}; choose another place.")
+        prepare_folder(file)
 
     reports: list[dict[str, Any]] = []
     failures = 0
@@ -220,17 +216,6 @@ def _output_pattern(out: str, recordings: int) -> str:
     return out
 
 
-def named_model(name: str) -> TongueModel:
-    """The bundled model, or the one in a file."""
-    if name == BUNDLED:
-        from ..bundled import bundled_model
-
-        return bundled_model()
-    from ...model.files import load_model
-
-    return load_model(name)
-
-
 def read_session(args: argparse.Namespace) -> Session:
     """The session file, with what --coils says on top."""
     from ..coilmap import checked_coil_map
@@ -239,7 +224,9 @@ def read_session(args: argparse.Namespace) -> Session:
     session = load_session(args.session) if args.session else Session()
     if not args.coils:
         return session
-    pairs = [pair.partition("=") for pair in args.coils.replace(" ", "").split(",") if pair]
+    pairs = [
+        tuple(part.strip() for part in pair.partition("=")) for pair in args.coils.split(",") if pair.strip()
+    ]
     if any(not channel or not role for channel, _, role in pairs):
         raise InputError(f"--coils {args.coils}: expected CHANNEL=ROLE pairs with commas between them.")
     coils = {channel: role for channel, _, role in pairs}
@@ -361,6 +348,7 @@ def run_mesh(args: argparse.Namespace) -> int:
         if args.every < 1:
             raise InputError(f"--every {args.every}: expected 1 or more.")
         frames = list(range(0, poses.frame_count, args.every))
+    prepare_folder(target)
     for frame in frames:
         mesh = Mesh(model.vertices(poses.speaker_weights[frame], poses.weights[frame]), model.faces)
         numbered = target.with_name(f"{target.stem}_{frame:06d}{target.suffix}")
