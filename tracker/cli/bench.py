@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 
 
 def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -21,6 +22,10 @@ def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]
 
 def run_bench(args: argparse.Namespace) -> int:
     """Measure, then print."""
+    # numpy reads these when it is first imported. On matrices of 9 x 9 the library's own threads only slow
+    # scipy down, and a ratio against a hobbled baseline would be worth nothing.
+    for library in ("OPENBLAS", "OMP", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     from contextlib import nullcontext
     from pathlib import Path
 
