@@ -202,8 +202,8 @@ def test_phones_move_the_tongue_by_millimetres_not_by_centimetres(shapes):
 def test_speakers_differ_and_the_set_is_not_exactly_multilinear(shapes):
     tensor = shapes.reshape(11, 13, -1) - shapes.reshape(11, 13, -1).mean(axis=(0, 1))
     parts = hosvd(tensor)
-    assert cumulative_compactness(parts.speaker_spectrum)[4] < 0.99
-    assert cumulative_compactness(parts.pose_spectrum)[3] < 0.99
+    assert cumulative_compactness(parts.speaker_spectrum)[4] < 0.97
+    assert cumulative_compactness(parts.pose_spectrum)[3] < 0.96
     kept = parts.truncated(5, 4)
     rebuilt = mode_product(mode_product(kept.core, kept.speaker_factors, 0), kept.pose_factors, 1)
     error = np.linalg.norm((tensor - rebuilt).reshape(11, 13, -1, 3), axis=-1).mean()
@@ -218,6 +218,30 @@ def test_no_spikes_and_no_folded_contours(shapes):
     lines = shapes[:, :, whole, 1:].reshape(-1, len(whole), 2)
     for line in lines:
         assert not crosses_itself(line)
+
+
+def sharpest_crease_deg(spoken):
+    """(...,) the largest angle between the normals of two neighbouring triangles: 180 is a fold."""
+    faces = TEMPLATE.faces
+    pairs, _ = edges()
+    owner = np.tile(np.arange(len(faces)), 3)
+    ends = np.sort(pairs, axis=1)
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    same = (ends[order[1:]] == ends[order[:-1]]).all(axis=1)
+    one, other = owner[order[1:]][same], owner[order[:-1]][same]
+    a, b, c = (spoken[..., faces[:, corner], :] for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.degrees(np.arccos((normals[..., one, :] * normals[..., other, :]).sum(axis=-1).min(axis=-1)))
+
+
+def test_the_surface_is_nowhere_folded(shapes):
+    """Not among the training speakers, and not among those whom the simulator draws."""
+    assert sharpest_crease_deg(shapes.reshape(-1, TEMPLATE.vertex_count, 3)).max() < 80
+    for seed in range(1000, 1010):
+        anatomy, habits = random_anatomy(seed), random_habits(seed)
+        spoken = np.array([tongue_surface(anatomy, articulation_for(anatomy, p, habits)) for p in PHONES])
+        assert sharpest_crease_deg(spoken).max() < 110, seed
 
 
 def crosses_itself(line):

@@ -18,13 +18,14 @@ REST_JAW_DEG = 4.0  # the neutral contour holds the jaw of a schwa
 # Cross-section at places along the contour (mm from the tip): half width in mm, and how flat its top is.
 # Narrow and flat at the tip, wide and rounder at the dorsum.
 PLACES = np.array([-30.0, -22.0, -12.0, -6.0, 0.0, 5.0, 12.0, 24.0, 38.0, 52.0, 66.0, 80.0, 110.0])
-HALF_WIDTHS = np.array([16.0, 15.0, 13.0, 12.0, 11.0, 13.0, 16.5, 21.0, 23.5, 23.0, 20.0, 18.0, 17.0])
-FLATNESSES = np.array([1.7, 1.8, 2.1, 2.3, 2.4, 2.3, 2.0, 1.8, 1.65, 1.6, 1.6, 1.5, 1.4])
+HALF_WIDTHS = np.array([5.0, 6.5, 8.5, 10.0, 12.0, 14.0, 17.5, 22.0, 24.5, 24.0, 21.0, 19.0, 18.0])
+FLATNESSES = np.array([1.7, 1.8, 1.9, 1.9, 1.9, 1.9, 1.9, 1.8, 1.65, 1.6, 1.6, 1.5, 1.4])
 # The open base: a straight line from behind the first row to before the last, in the sagittal plane.
 BASE_BEHIND_FRONT_MM = np.array([5.0, -2.0])
 BASE_BEFORE_ROOT_MM = np.array([-11.0, -2.0])
+TEETH_BEHIND_EDGE_MM = 2.0  # inner side of the incisors, behind their edge
 AIR_CHANNEL_MM = 1.2  # the phones are vowels and sibilants: air passes along the middle
-CONTACT_SHARPNESS = 2.2  # 1/mm: how closely the surface follows what it touches
+CONTACT_SOFTNESS_MM = 0.5  # how near a wall its pressure is felt
 
 
 def tongue_surface(anatomy: Anatomy, articulation: Articulation) -> FloatArray:
@@ -72,7 +73,8 @@ def _contour(anatomy: Anatomy, articulation: Articulation, template: TongueTempl
     normal = _normals(contour)
 
     body = _plateau(s, 6.0, 66.0, 9.0)
-    contour[:, 0] -= size * a.body_front_mm * body
+    followers = 0.6 * body + 0.4 * _plateau(s, -80.0, 66.0, 9.0)  # the tip and the floor follow in part
+    contour[:, 0] -= size * a.body_front_mm * followers
     contour[:, 1] += size * a.body_up_mm * _plateau(s, 10.0, 62.0, 9.0)
     contour[:, 0] -= size * a.root_front_mm * _plateau(s, 66.0, 140.0, 8.0)
 
@@ -80,7 +82,8 @@ def _contour(anatomy: Anatomy, articulation: Articulation, template: TongueTempl
     contour += size * a.arch_mm * _bell(s, place, 12.5)[:, None] * normal
 
     at_tip = _plateau(s, -9.0, 5.0, 4.5)
-    contour[:, 0] -= size * a.tip_front_mm * _plateau(s, -14.0, 8.0, 5.0)
+    front = 0.3 * _plateau(s, -14.0, 9.0, 7.0) + 0.7 * _plateau(s, -80.0, 9.0, 7.0)
+    contour[:, 0] -= size * a.tip_front_mm * front
     contour[:, 1] += size * a.tip_up_mm * at_tip
     contour[:, 1] += size * a.blade_up_mm * _bell(s, 11.0, 8.0)
 
@@ -89,9 +92,26 @@ def _contour(anatomy: Anatomy, articulation: Articulation, template: TongueTempl
     hinge = HINGE * size * np.array([anatomy.mouth, 1.0])
     rest = contour - hinge
     cos, sin = np.cos(angle), np.sin(angle)
-    return np.column_stack(
+    rotated = np.column_stack(
         [hinge[0] + cos * rest[:, 0] - sin * rest[:, 1], hinge[1] + sin * rest[:, 0] + cos * rest[:, 1]]
     )
+    return _stopped(rotated, anatomy, s)
+
+
+def _stopped(contour: FloatArray, anatomy: Anatomy, s: FloatArray) -> FloatArray:
+    """The contour with its tip held back by the incisors, and held down where it would enter the palate.
+
+    Flesh beside and below a contact is moved along with it: pressing alone would squeeze the tip flat.
+    """
+    stopped = contour.copy()
+    too_far = float(_soft_positive(TEETH_BEHIND_EDGE_MM * anatomy.size - contour[:, 0].min()))
+    stopped[:, 0] += too_far * _plateau(s, -80.0, 12.0, 7.0)
+    palate = anatomy.palate_z(np.zeros(len(s)), stopped[:, 0])
+    upper = (s > -4.0) & (s < 60.0)
+    too_high = np.where(upper, _soft_positive(stopped[:, 1] - palate + AIR_CHANNEL_MM * anatomy.size), 0.0)
+    nearness = np.exp(-0.5 * ((s[:, None] - s[None, :]) / 8.0) ** 2)
+    stopped[:, 1] -= _smooth((nearness * too_high[None, :]).max(axis=1))
+    return stopped
 
 
 def _swept(anatomy: Anatomy, articulation: Articulation, template: TongueTemplate) -> FloatArray:
@@ -100,7 +120,7 @@ def _swept(anatomy: Anatomy, articulation: Articulation, template: TongueTemplat
     The tongue is incompressible: what the profile loses it gains in width, within limits.
     """
     swept = _swept_unscaled(anatomy, articulation, template)
-    swept[:, 0] *= float(np.clip(_rest_volume(anatomy) / enclosed_volume(swept), 0.86, 1.16))
+    swept[:, 0] *= float(np.clip(_rest_volume(anatomy) / enclosed_volume(swept), 0.80, 1.25))
     return swept
 
 
@@ -117,6 +137,9 @@ def _swept_unscaled(anatomy: Anatomy, articulation: Articulation, template: Tong
     contour = _contour(anatomy, a, template)
     sine = np.sin(theta)[None, :]
     half_width = size * anatomy.width * _smooth(np.interp(s, PLACES, HALF_WIDTHS))
+    # Between the teeth a whole row gets narrower; only what is left of the excess is pressed flat later.
+    excess = half_width - 0.85 * anatomy.arch_half_width(contour[:, 0])
+    half_width -= _smooth(_soft_positive(excess) * _between_teeth(contour[:, 0], contour[:, 1], size))
     x = half_width[:, None] * sine
     # In the sagittal plane every row runs straight from the contour to its place on the base.
     start, end = contour[0] + size * BASE_BEHIND_FRONT_MM, contour[-1] + size * BASE_BEFORE_ROOT_MM
@@ -124,10 +147,10 @@ def _swept_unscaled(anatomy: Anatomy, articulation: Articulation, template: Tong
     to_base = start + share[:, None] * (end - start) - contour
     length = np.linalg.norm(to_base, axis=1)
     to_base /= length[:, None]
-    flatness = _smooth(np.interp(s, PLACES, FLATNESSES)) + 0.8 * a.flat * _plateau(s, 0.0, 60.0, 8.0)
+    flatness = _smooth(np.interp(s, PLACES, FLATNESSES)) + 0.8 * a.flat * _plateau(s, 10.0, 60.0, 8.0)
     drop = length[:, None] * (1.0 - np.cos(theta))[None, :] ** flatness[:, None]
     pressed_side = np.exp(-0.5 * ((np.abs(template.theta) - 50.0) / 14.0) ** 2)[None, :]
-    drop -= size * a.brace_mm * _plateau(s, 8.0, 56.0, 9.0)[:, None] * pressed_side
+    drop -= size * a.brace_mm * _plateau(s, 14.0, 56.0, 7.0)[:, None] * pressed_side
     groove = _groove_depth(anatomy, a, template)
     drop += groove[:, None] * np.exp(-0.5 * (x / (4.2 * size)) ** 2)
     drop -= size * a.tilt_mm * _plateau(s, -10.0, 60.0, 10.0)[:, None] * sine * np.cos(theta)[None, :]
@@ -139,7 +162,7 @@ def _swept_unscaled(anatomy: Anatomy, articulation: Articulation, template: Tong
 def _base_share(s: FloatArray) -> FloatArray:
     """(rows,) 0 .. 1 along the base: the underside and the tip keep to its front, the root to its end."""
     places = np.array([-30.0, -22.0, 0.0, 12.0, 24.0, 40.0, 56.0, 72.0, 90.0, 110.0])
-    shares = np.array([0.0, 0.03, 0.10, 0.16, 0.25, 0.42, 0.62, 0.80, 0.94, 1.0])
+    shares = np.array([0.0, 0.02, 0.09, 0.16, 0.26, 0.42, 0.61, 0.78, 0.92, 1.0])
     share = _smooth(np.interp(s, places, shares))
     return np.asarray((share - share[0]) / (share[-1] - share[0]))
 
@@ -159,9 +182,7 @@ def _pressed_against_walls(vertices: FloatArray, anatomy: Anatomy, groove: Float
     a distance, more so where the tongue is grooved, or pressing would iron the groove out. groove: (n,) mm.
     """
     pressed = vertices.copy()
-    between_teeth = _plateau(vertices[:, 2], -7.0 * anatomy.size, 60.0, 3.0) * _plateau(
-        vertices[:, 1], -3.0, 50.0, 4.0
-    )
+    between_teeth = _between_teeth(vertices[:, 1], vertices[:, 2], anatomy.size)
     beside = 0.97 * anatomy.arch_half_width(vertices[:, 1]) - np.abs(vertices[:, 0])
     pressed[:, 0] -= np.sign(vertices[:, 0]) * (_soft_positive(beside) - beside) * between_teeth
     channel = (AIR_CHANNEL_MM + groove) * np.exp(-0.5 * (vertices[:, 0] / (4.2 * anatomy.size)) ** 2)
@@ -173,9 +194,18 @@ def _pressed_against_walls(vertices: FloatArray, anatomy: Anatomy, groove: Float
     return pressed
 
 
-def _soft_positive(room: FloatArray) -> FloatArray:
-    """A smooth function above max(room, 0) that comes close to it within a millimetre."""
-    return np.logaddexp(0.0, CONTACT_SHARPNESS * room) / CONTACT_SHARPNESS
+def _between_teeth(y: FloatArray, z: FloatArray, size: float) -> FloatArray:
+    """About 1 where the upper teeth stand beside the tongue, 0 below and behind them."""
+    return _plateau(z, -7.0 * size, 60.0, 3.0) * _plateau(y, -3.0, 50.0, 4.0)
+
+
+def _soft_positive(room: FloatArray | float) -> FloatArray:
+    """A smooth function above max(room, 0), near it a millimetre away on either side.
+
+    Its slope dies out slowly, so that what is pressed flat is thinned, and no triangle vanishes.
+    """
+    room = np.asarray(room)
+    return np.asarray(0.5 * (room + np.sqrt(room**2 + 4.0 * CONTACT_SOFTNESS_MM**2)))
 
 
 def _normals(contour: FloatArray) -> FloatArray:
