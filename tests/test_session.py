@@ -1,10 +1,12 @@
 """The session file, the coil map, and how both meet a recording."""
 
+import itertools
+
 import numpy as np
 import pytest
 from tonguetrack.drivers.frames import FrameOfReference, Recording
 from tonguetrack.tracker.coilmap import guess_coil_map
-from tonguetrack.tracker.session import Alignment, Energy, Session, load_session, session_toml
+from tonguetrack.tracker.session import Alignment, Energy, Session, axis_mapping, load_session, session_toml
 from tonguetrack.tracker.setup import complete_setup, suggested_axes
 
 from tonguetrack import InputError
@@ -71,6 +73,30 @@ def test_what_is_written_is_read_back_unchanged(tmp_path):
     np.testing.assert_array_equal(again.speaker_weights, session.speaker_weights)
 
 
+def test_odd_channel_names_survive_the_file(tmp_path):
+    odd = [
+        "a.b",
+        'say "tip"',
+        "Zunge ə",
+        " led by a space",
+        "it's",
+        "#1",
+        "[x]",
+        "a = b",
+        "tab\there",
+        "\\",
+        "\u2028",
+        "",
+    ]
+    roles = ["tongue_tip", *(f"tongue_own_{number}" for number in range(1, len(odd)))]
+    session = Session(coils=dict(zip(odd, roles, strict=True)), speaker_source='of "x"\nand ə')
+    again = load_session(write(tmp_path, session_toml(session)))
+    assert again.coils == session.coils
+    assert list(again.coils) == odd
+    assert again.speaker_weights is None
+    assert again.alignment.is_identity
+
+
 def test_an_empty_session_states_nothing(tmp_path):
     session = load_session(write(tmp_path, ""))
     assert not session.coils
@@ -100,6 +126,14 @@ def test_an_empty_session_states_nothing(tmp_path):
         ("[speaker]\nweights = ['a']", "expected numbers only"),
         ("[speaker]\nweights = [nan]", "expected finite numbers"),
         ("[energy]\nbeta = 3", r"\[energy\] has the unknown key 'beta'; expected alpha, beta_pose"),
+        ("[speaker]\nweights = []", "expected finite numbers in one list"),
+        ("[speaker]\nweights = [[0.1]]", "expected finite numbers in one list"),
+        ("[speaker]\nweights = ['0.1']", "expected numbers only"),
+        ("[speaker]\nweights = [true]", "expected numbers only"),
+        (f"[speaker]\nweights = [{10**400}]", "expected numbers only"),
+        ("[speaker]\nsource = 3", r"\[speaker\] source = 3: expected text"),
+        (f"[energy]\nalpha = {10**400}", r"\[energy\] alpha: the number is too large"),
+        ("[energy]\nalpha = 1e300", "expected a finite number, above 0, of at most 1e[+]12"),
         ("[energy]\nbox = 0", r"\[energy\] box = 0.0: expected a finite number, above 0"),
         ("[energy]\ngamma_pose = -1", "expected a finite number, 0 or more"),
         ("[energy]\nalpha = inf", "expected a finite number"),
@@ -179,7 +213,22 @@ def test_a_stated_session_is_followed_to_the_letter(tmp_path, small_model, tongu
     assert setup.channels == ("T1", "T3")
     assert setup.roles == ("tongue_tip", "tongue_dorsum")
     assert setup.vertices == (3, 12)
-    assert any("chosen on the model 0123456789abcdef" in decision for decision in setup.decisions)
+    assert any("vertices and speaker were chosen on the model 0123456789abcdef" in d for d in setup.decisions)
+
+
+def test_a_speaker_of_another_model_is_pointed_out_even_without_its_vertices(small_model, tongue):
+    session = Session(speaker_weights=np.zeros(5), model_fingerprint="0123456789abcdef")
+    told = complete_setup(tongue, small_model, session).decisions
+    assert any("speaker were chosen on the model 0123456789abcdef" in decision for decision in told)
+
+
+def test_coils_far_from_the_model_are_pointed_out(small_model, tongue):
+    far = recording_of(tongue.coils, tongue.positions + 1000.0)
+    told = " ".join(complete_setup(far, small_model, Session()).decisions)
+    assert (
+        "mm away from the model even at its best vertex; the recording is hardly in the model's frame" in told
+    )
+    assert "away from the model" not in " ".join(complete_setup(tongue, small_model, Session()).decisions)
 
 
 def test_what_is_absent_is_estimated_and_said(small_model, tongue):
@@ -236,6 +285,23 @@ def test_a_session_that_contradicts_recording_or_model_is_refused(small_model, t
 )
 def test_a_known_frame_suggests_its_axes(frame, axes):
     assert suggested_axes(FrameOfReference(*frame)) == axes
+
+
+@pytest.mark.parametrize("frame", list(itertools.permutations(("left/right", "front/back", "up/down"))))
+def test_a_right_handed_frame_is_turned_never_mirrored(frame):
+    direction = {"left": [1, 0, 0], "back": [0, 1, 0], "up": [0, 0, 1]}
+    direction |= {"right": [-1, 0, 0], "front": [0, -1, 0], "down": [0, 0, -1]}
+    for axes in itertools.product(*(pair.split("/") for pair in frame)):
+        in_model = np.array([direction[axis] for axis in axes]).T
+        found = axis_mapping(suggested_axes(FrameOfReference(*axes)))
+        np.testing.assert_array_equal(found, in_model)
+        assert np.linalg.det(found) == pytest.approx(np.linalg.det(in_model))
+
+
+def test_a_session_that_only_projects_still_gets_the_hint(small_model, tongue):
+    foreign = recording_of(tongue.coils, tongue.positions, frame=FrameOfReference("front", "left", "up"))
+    setup = complete_setup(foreign, small_model, Session(alignment=Alignment(midsagittal=True)))
+    assert any("[alignment] needs axes" in decision for decision in setup.decisions)
 
 
 def test_a_foreign_frame_is_hinted_at_but_never_turned_unasked(small_model, tongue):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from tonguetrack.tracker import kernels
 from tonguetrack.tracker.pose import PoseStatus
-from tonguetrack.tracker.session import Energy
+from tonguetrack.tracker.preparation import Preparation
+from tonguetrack.tracker.session import Alignment, Energy
 from tonguetrack.tracker.solver import FixedSpeakerSolver, FreeSpeakerSolver
 
 VERTICES = [3, 9, 15]
@@ -120,5 +121,40 @@ def test_no_kernel_is_compiled_twice(small_model):
     speaker = small_model.for_speaker(small_model.speaker.mean)
     FixedSpeakerSolver(speaker.at(VERTICES), Energy()).solve_all(moving_coils(small_model))
     FreeSpeakerSolver(small_model.at(VERTICES), Energy()).solve_all(moving_coils(small_model))
-    for name in ("solve_fixed_speaker", "solve_free_speaker", "track_fixed_speaker", "track_free_speaker"):
+    read_only = moving_coils(small_model)
+    read_only.setflags(write=False)
+    for coils in (read_only, read_only[::2], np.asfortranarray(read_only)):
+        FixedSpeakerSolver(speaker.at(VERTICES), Energy()).solve_all(coils)
+        FreeSpeakerSolver(small_model.at(VERTICES), Energy()).solve_all(coils)
+        preparation = Preparation(np.arange(3), Alignment())
+        preparation.all_frames(coils)
+        preparation.frame(coils[0])
+        preparation.frame(coils[0].astype(np.float32))
+    compiled = [name for name in vars(kernels) if hasattr(getattr(kernels, name), "signatures")]
+    assert len(compiled) > 10
+    for name in compiled:
         assert len(getattr(kernels, name).signatures) <= 1, name
+
+
+@pytest.mark.parametrize("experiment", ["fixed", "free"])
+@pytest.mark.parametrize("alpha", [1e-9, 1.0, 1e12])
+@pytest.mark.parametrize("bias", [0.0, 5.0])
+@pytest.mark.parametrize("box", [1e-12, 5.0])
+def test_no_coordinates_and_no_energy_make_a_weight_nan(small_model, experiment, alpha, bias, box):
+    energy = Energy(alpha, bias, bias, bias, bias, box)
+    vertices = [3, 3, 9, 15]
+    speaker = small_model.for_speaker(small_model.speaker.mean)
+    solver = (
+        FixedSpeakerSolver(speaker.at(vertices), energy)
+        if experiment == "fixed"
+        else FreeSpeakerSolver(small_model.at(vertices), energy)
+    )
+    shape = small_model.mean_vertices()[vertices]
+    raw = np.stack(
+        [np.full((4, 3), x) for x in (np.nan, 0.0, -0.0, 5e-324, 1e6, 1e9, 1e150, 1e300, np.inf, -np.inf)]
+        + [shape, np.repeat(shape[:1], 4, axis=0), shape + 1e6, shape * [1, np.nan, 1]]
+    )
+    solved = solver.solve_all(Preparation(np.arange(4), Alignment()).all_frames(raw))
+    assert np.isfinite(solved.weights).all()
+    assert list(solved.statuses) == [0] + [1] * 5 + [2] * 4 + [1] * 3 + [2]
+    assert (np.isfinite(solved.results[:, 0]) == (solved.statuses == PoseStatus.OK)).all()

@@ -174,16 +174,18 @@ def test_the_quadratic_programme_satisfies_its_optimality_conditions():
 
 def test_an_indefinite_quadratic_is_reported_not_solved():
     x = np.zeros(2)
-    outcome = kernels.minimise_quadratic_in_box(
-        np.diag([1.0, -1.0]), np.ones(2), -np.ones(2), np.ones(2), x, kernels.quadratic_scratch(2)
-    )
-    assert outcome == kernels.INDEFINITE
+    for hessian in (np.diag([1.0, -1.0]), np.full((2, 2), np.nan)):
+        outcome = kernels.minimise_quadratic_in_box(
+            hessian, np.ones(2), -np.ones(2), np.ones(2), x, kernels.quadratic_scratch(2)
+        )
+        assert outcome == kernels.INDEFINITE
+        assert np.isfinite(x).all()
 
 
-def test_the_fixed_speaker_solution_is_the_minimum_on_thousands_of_frames(small_model):
+def test_the_fixed_speaker_solution_is_the_minimum_on_hundreds_of_frames(small_model):
     random = np.random.default_rng(3)
     at_bound = missing = 0
-    for _ in range(2000):
+    for _ in range(500):
         case = random_case(small_model, random)
         s = case.previous[:5]
         solver = FixedSpeakerSolver(case.model.for_speaker(s), case.energy)
@@ -207,14 +209,14 @@ def test_the_fixed_speaker_solution_is_the_minimum_on_thousands_of_frames(small_
         assert ((low[5:] <= solver.weights) & (solver.weights <= high[5:])).all()
         at_bound += bool(((solver.weights == low[5:]) | (solver.weights == high[5:])).any())
         missing += bool(np.isnan(case.coils).any())
-    assert at_bound > 300
-    assert missing > 500
+    assert at_bound > 75
+    assert missing > 125
 
 
-def test_the_free_speaker_solution_is_a_minimum_on_thousands_of_frames(small_model):
+def test_the_free_speaker_solution_is_a_minimum_on_hundreds_of_frames(small_model):
     random = np.random.default_rng(4)
     at_bound = missing = elsewhere = 0
-    frames = 2000
+    frames = 500
     for _ in range(frames):
         case = random_case(small_model, random)
         weights, solver = solved_free(case)
@@ -229,9 +231,22 @@ def test_the_free_speaker_solution_is_a_minimum_on_thousands_of_frames(small_mod
             elsewhere += 1
         at_bound += bool(((weights == low) | (weights == high)).any())
         missing += bool(np.isnan(case.coils).any())
-    assert at_bound > 300
-    assert missing > 500
+    assert at_bound > 75
+    assert missing > 125
     assert elsewhere < 0.02 * frames
+
+
+def test_the_floor_of_a_long_curved_valley_is_reached(small_model):
+    """Strong data and hardly any bias: along (c s, p / c) the energy is almost level, and bends."""
+    random = np.random.default_rng(11)
+    for _ in range(60):
+        case = random_case(small_model, random, coils=int(random.integers(1, 4)))
+        case.energy = Energy(alpha=100.0, beta_speaker=0.05, beta_pose=0.05, gamma_pose=0.0, box=8.0)
+        low, high = case.bounds
+        case.previous = np.where(random.random(len(low)) < 0.5, low, high)
+        weights, _ = solved_free(case)
+        ours, _ = case.value_and_gradient(weights)
+        assert ours <= tight_minimum(case, weights).fun * (1 + 1e-8) + 1e-12
 
 
 def test_a_restart_tries_the_mirrored_weights_and_keeps_the_best(small_model):

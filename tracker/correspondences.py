@@ -10,7 +10,7 @@ while that helps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -24,6 +24,8 @@ from .coilmap import LATERAL_ROLES, TONGUE_ROLES
 from .pose import FloatArray
 from .session import Energy
 from .solver import FixedSpeakerSolver, FreeSpeakerSolver
+
+Places = tuple[int, ...]  # one candidate for each coil: an index into the contour, then the upper surface
 
 TIP_TO_ROOT = TONGUE_ROLES[4]
 BOX_WHILE_SEARCHING = 1.0
@@ -71,7 +73,7 @@ def estimate_correspondences(
     middle = [index for index in range(len(roles)) if index not in lateral]
     if all(roles[index] in TIP_TO_ROOT for index in middle):
         middle.sort(key=lambda index: TIP_TO_ROOT.index(roles[index]))
-    if len(contour) < max(len(middle), 1):
+    if len(contour) < len(middle):
         raise InputError(
             f"the model '{model.name}' has {len(contour)} vertices of its upper surface near the plane x = 0, too "
             f"few for {len(middle)} coils; state the vertices in the session's [correspondences]."
@@ -80,7 +82,7 @@ def estimate_correspondences(
     places = np.concatenate([contour, surface])
     search = _Search(model.at([int(vertex) for vertex in places]), replace(energy, box=BOX_WHILE_SEARCHING))
 
-    def nearest(shape: FloatArray, target: FloatArray) -> tuple[int, ...]:
+    def nearest(shape: FloatArray, target: FloatArray) -> Places:
         chosen = np.zeros(len(roles), dtype=np.intp)
         if middle:
             chosen[middle] = ordered_nearest(shape[: len(contour)], target[middle])
@@ -113,7 +115,7 @@ class _Search:
     def __init__(self, candidates: TongueModel, energy: Energy) -> None:
         self._candidates = candidates
         self._energy = energy
-        self._distances: dict[tuple[int, ...], FloatArray] = {}
+        self._distances: dict[Places, FloatArray] = {}
 
     def random_starts(self) -> FloatArray:
         """(RANDOM_SHAPES, m + n) weights, uniform within one sigma of the mean."""
@@ -123,10 +125,12 @@ class _Search:
         random = np.random.default_rng(SEED)
         return np.asarray(mean + sigma * random.uniform(-1.0, 1.0, (RANDOM_SHAPES, len(mean))))
 
-    def settled(self, weights: FloatArray, target: FloatArray, nearest) -> tuple[int, ...]:  # type: ignore[no-untyped-def]
+    def settled(
+        self, weights: FloatArray, target: FloatArray, nearest: Callable[[FloatArray, FloatArray], Places]
+    ) -> Places:
         """The set of places at which choosing the nearest and refitting come to rest."""
         model = self._candidates
-        chosen: tuple[int, ...] = ()
+        chosen: Places = ()
         for _ in range(MAX_REFITS):
             shape = model.vertices(weights[: model.speaker.size], weights[model.speaker.size :])
             found = nearest(shape, target)
@@ -138,7 +142,7 @@ class _Search:
             weights = solver.weights
         return chosen
 
-    def mean_distances(self, chosen: tuple[int, ...], frames: FloatArray) -> FloatArray:
+    def mean_distances(self, chosen: Places, frames: FloatArray) -> FloatArray:
         """(n,) mean distance of each coil over the frames, all fitted with the anatomy that they agree on."""
         if chosen not in self._distances:
             at_coils = self._candidates.at(chosen)
@@ -158,7 +162,9 @@ class _Search:
         return self._distances[chosen]
 
 
-def _slid_along_contour(best, middle, contour_length, cost):  # type: ignore[no-untyped-def]
+def _slid_along_contour(
+    best: Places, middle: Sequence[int], contour_length: int, cost: Callable[[Places], float]
+) -> Places:
     """Moves one coil at a time along the contour, in halving strides, while the cost falls."""
     stride = LONGEST_SLIDE
     while stride:

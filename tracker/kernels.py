@@ -36,13 +36,18 @@ from numba import njit
 OPTIONS: dict[str, Any] = {"cache": True, "inline": "never", "error_model": "numpy"}
 
 # A step is the last one when it promises to lower the energy by less than this share of it. An exact Newton
-# step leaves about the square of what it promised, so it may promise more.
+# step whose promise holds to within the share KEPT_PROMISE leaves about the square of that share, so it may
+# promise more.
 RELATIVE_DECREASE = 1e-12
 EXACT_NEWTON_DECREASE = 1e-7
-MAX_NEWTON_STEPS = 100
+KEPT_PROMISE = 0.05
+MAX_NEWTON_STEPS = 200
 MAX_ACTIVE_SET_STEPS = 200
 # Gauss-Newton is cheap far from the minimum, but only linear near it where residuals are large.
 GAUSS_NEWTON_STEPS = 6
+
+# No coil is a thousand kilometres away: beyond is a damaged number, whose square would swamp every other.
+FARTHEST_MM = 1e9
 
 STATUS_LOST, STATUS_OK, STATUS_HELD = 0, 1, 2
 INDEFINITE, SOLVED = 0, 1
@@ -69,7 +74,9 @@ def minimise_quadratic_in_box(hessian, linear, low, high, x, scratch):
     """Minimises 1/2 x'Hx - linear'x over the box, from x, in place.
 
     Returns SOLVED when x is the minimiser; INDEFINITE when H is not positive definite on a face of the
-    box that had to be minimised: x is then the best point reached, possibly the start.
+    box that had to be minimised, or holds what is not a number: x is then the best point reached, possibly
+    the start. After MAX_ACTIVE_SET_STEPS faces, far more than random programmes ever need, it returns the
+    best point reached as SOLVED.
 
     Primal active set: a Newton step on the free coordinates up to the first bound in the way, which is
     then held; at a face's minimum the held bound that pulls inwards most is let go. Bounds that hold
@@ -114,7 +121,7 @@ def minimise_quadratic_in_box(hessian, linear, low, high, x, scratch):
                     for c in range(b):
                         total -= factor[a, c] * factor[b, c]
                     if a == b:
-                        if total <= 1e-14 * abs(hessian[i, i]):
+                        if not total > 1e-14 * abs(hessian[i, i]):  # also where it is not a number
                             return INDEFINITE
                         factor[a, a] = np.sqrt(total)
                     else:
@@ -177,6 +184,16 @@ def minimise_quadratic_in_box(hessian, linear, low, high, x, scratch):
 
 
 @njit(**OPTIONS)
+def _present(coils):
+    """How many of the coils (n, 3) are there."""
+    present = 0
+    for i in range(coils.shape[0]):
+        if not np.isnan(coils[i, 0]):
+            present += 1
+    return present
+
+
+@njit(**OPTIONS)
 def coil_residuals(coils, base, directions, weights, residuals):
     """residuals (n,): distance in mm of each coil from its vertex, NaN where the coil is missing.
     Returns their mean over the present coils (NaN without any)."""
@@ -227,10 +244,7 @@ def solve_fixed_speaker(
     gamma = energy[2] if coherent else 0.0
     hessian = scratch[:size]
     linear = scratch[size]
-    present = 0
-    for i in range(coils.shape[0]):
-        if not np.isnan(coils[i, 0]):
-            present += 1
+    present = _present(coils)
     if present == 0:
         result[0] = np.nan
         result[1] = coil_residuals(coils, base, directions, weights, residuals)
@@ -263,13 +277,15 @@ def solve_fixed_speaker(
         # that float64 can factorise picks the solution next to the previous weights.
         trace = 0.0
         for a in range(size):
+            weights[a] = previous[a]
             trace += abs(hessian[a, a])
+        if not np.isfinite(trace):
+            break
         added = max(1e-10 * trace, 1e-12) if ridge == 0.0 else 9.0 * ridge
         ridge += added
         for a in range(size):
             hessian[a, a] += added
             linear[a] += added * previous[a]
-            weights[a] = previous[a]
     mean_residual = coil_residuals(coils, base, directions, weights, residuals)
     total = 0.0
     for i in range(coils.shape[0]):
@@ -318,10 +334,7 @@ def _jacobian_and_residual(coils, base, core, weights, jacobian, residual):
 def free_energy(coils, base, core, box, alpha, beta, gamma, previous, weights, jacobian, residual):
     """E at `weights`; leaves the Jacobian and the residual of that point behind. beta, gamma: (m + n,)."""
     _jacobian_and_residual(coils, base, core, weights, jacobian, residual)
-    present = 0
-    for i in range(coils.shape[0]):
-        if not np.isnan(coils[i, 0]):
-            present += 1
+    present = _present(coils)
     total = 0.0
     for row in range(residual.shape[0]):
         total += residual[row] * residual[row]
@@ -340,10 +353,7 @@ def free_gradient_and_hessian(
     """Derivatives of `free_energy` from the Jacobian and residual it left. exact: with the bilinear term
     of the Hessian; else Gauss-Newton's, which is never indefinite."""
     speakers, poses, rows = core.shape
-    present = 0
-    for i in range(coils.shape[0]):
-        if not np.isnan(coils[i, 0]):
-            present += 1
+    present = _present(coils)
     share = 2.0 * alpha / present
     for a in range(weights.shape[0]):
         total = 0.0
@@ -388,36 +398,20 @@ def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scra
     second_order = coil_scratch[size + 2]
     for a in range(size):
         weights[a] = min(max(weights[a], box[1, a]), box[2, a])
-    present = 0
-    for i in range(coils.shape[0]):
-        if not np.isnan(coils[i, 0]):
-            present += 1
+    present = _present(coils)
     share = alpha / present
-    gauss_newton_steps = (
-        GAUSS_NEWTON_STEPS  # the first resort where the exact Hessian is not positive definite
-    )
+    gauss_newton_steps = GAUSS_NEWTON_STEPS  # the first resort where the Hessian is not positive definite
+    last_shift = 0.0  # the next one begins lower: in a curved valley a large shift means tiny steps
     for _ in range(MAX_NEWTON_STEPS):
         energy = free_energy(
             coils, base, core, box, alpha, beta, gamma, previous, weights, jacobian, residual
         )
         shift = 0.0
         exact = True
-        stationary_if_small = True
         free_gradient_and_hessian(
-            coils,
-            core,
-            box,
-            alpha,
-            beta,
-            gamma,
-            previous,
-            weights,
-            jacobian,
-            residual,
-            exact,
-            gradient,
+            coils, core, box, alpha, beta, gamma, previous, weights, jacobian, residual, exact, gradient,
             hessian,
-        )
+        )  # fmt: skip
         while True:
             for a in range(size):
                 total = -gradient[a]
@@ -447,41 +441,19 @@ def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scra
                 exact = False
                 gauss_newton_steps -= 1
                 free_gradient_and_hessian(
-                    coils,
-                    core,
-                    box,
-                    alpha,
-                    beta,
-                    gamma,
-                    previous,
-                    weights,
-                    jacobian,
-                    residual,
-                    exact,
-                    gradient,
+                    coils, core, box, alpha, beta, gamma, previous, weights, jacobian, residual, exact, gradient,
                     hessian,
-                )
+                )  # fmt: skip
                 continue
             if shift == 0.0:
                 exact = True
                 free_gradient_and_hessian(
-                    coils,
-                    core,
-                    box,
-                    alpha,
-                    beta,
-                    gamma,
-                    previous,
-                    weights,
-                    jacobian,
-                    residual,
-                    exact,
-                    gradient,
+                    coils, core, box, alpha, beta, gamma, previous, weights, jacobian, residual, exact, gradient,
                     hessian,
-                )
+                )  # fmt: skip
                 for a in range(size):
                     shift += abs(hessian[a, a])
-                shift = 1e-3 * shift / size + 1e-12
+                shift = max(1e-3 * shift / size if last_shift == 0.0 else last_shift / 16.0, 1e-12)
             else:
                 shift *= 8.0
             if shift > 1e30:
@@ -529,12 +501,29 @@ def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scra
         while change > 1e-4 * length * slope and length > 1e-12:
             length *= 0.5
             change = length * (slope + length * (second + length * (third + length * fourth)))
+        if shift > 0.0 and length == 1.0:
+            # A shifted step is a cautious one: go on while that lowers the energy, up to the box.
+            while True:
+                longer = 2.0 * length
+                for a in range(size):
+                    moved = weights[a] + longer * (target[a] - weights[a])
+                    if moved < box[1, a] or moved > box[2, a]:
+                        longer = 0.0
+                        break
+                further = longer * (slope + longer * (second + longer * (third + longer * fourth)))
+                if further >= change:  # also at the box, where `further` is 0
+                    break
+                length = longer
+                change = further
         if change > 0.0:
             return energy
+        if shift > 0.0:
+            last_shift = shift if length >= 1.0 else 16.0 * shift
         for a in range(size):
             moved = target[a] if length == 1.0 else weights[a] + length * (target[a] - weights[a])
             weights[a] = min(max(moved, box[1, a]), box[2, a])
-        enough = EXACT_NEWTON_DECREASE if exact and shift == 0.0 else RELATIVE_DECREASE
+        kept = exact and shift == 0.0 and abs(change + promised) <= KEPT_PROMISE * promised
+        enough = EXACT_NEWTON_DECREASE if kept else RELATIVE_DECREASE
         if stationary_if_small and promised <= enough * energy + 1e-24:
             return energy + change
         if not exact and -change < 0.25 * promised:
@@ -555,10 +544,7 @@ def solve_free_speaker(
     """
     size = weights.shape[0]
     speakers = core.shape[0]
-    present = 0
-    for i in range(coils.shape[0]):
-        if not np.isnan(coils[i, 0]):
-            present += 1
+    present = _present(coils)
     beta = scratch[3 * size + 7]
     gamma = scratch[3 * size + 8]
     previous = scratch[3 * size + 9]
@@ -611,21 +597,24 @@ def prepare_frame(raw, picked, rotation, translation, project, coils):
 
     picked (n,): indices into raw; rotation (3, 3), translation (3,) mm: model = rotation raw +
     translation; project: set the lateral coordinate to the mid-sagittal plane's 0. A coil with any
-    coordinate that is not a finite number becomes all NaN.
+    coordinate that is not a number, or beyond FARTHEST_MM, becomes all NaN.
     """
     for i in range(picked.shape[0]):
         x = raw[picked[i], 0]
         y = raw[picked[i], 1]
         z = raw[picked[i], 2]
-        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
-            for axis in range(3):
-                coils[i, axis] = np.nan
-            continue
+        usable = True
         for axis in range(3):
             coils[i, axis] = (
                 rotation[axis, 0] * x + rotation[axis, 1] * y + rotation[axis, 2] * z + translation[axis]
             )
-        if project:
+            usable = (
+                usable and abs(raw[picked[i], axis]) <= FARTHEST_MM and abs(coils[i, axis]) <= FARTHEST_MM
+            )
+        if not usable:
+            for axis in range(3):
+                coils[i, axis] = np.nan
+        elif project:
             coils[i, 0] = 0.0
 
 

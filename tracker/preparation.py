@@ -50,7 +50,8 @@ class Preparation:
         """(frames, n, 3) from raw (frames, all coils, 3)."""
         prepared = np.empty((len(raw), len(self._picked), 3))
         kernels.prepare_frames(
-            np.ascontiguousarray(raw, dtype=np.float64),
+            # A read-only array is another type for the compiler; such a one is copied.
+            np.require(raw, np.float64, ["C_CONTIGUOUS", "WRITEABLE"]),
             self._picked,
             self._rotation,
             self._translation,

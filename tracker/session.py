@@ -39,6 +39,7 @@ from .coilmap import checked_coil_map
 from .pose import FloatArray
 
 MAX_SESSION_BYTES = 1024 * 1024
+LARGEST_TERM = 1e12  # of the energy's weights: beyond, float64 loses the other terms
 NO_SESSION = "no session file"
 
 
@@ -46,9 +47,9 @@ NO_SESSION = "no session file"
 class Alignment:
     """Rigid motion from the source's frame to the model frame: model = rotation @ source + translation.
 
-    rotation: (3, 3), orthonormal, right-handed unless the source itself is left-handed (axis mappings
-    may mirror; a matrix may not); translation_mm: (3,). midsagittal: afterwards the lateral coordinate
-    is set to 0, as the paper does with mid-sagittal coils.
+    rotation: (3, 3), orthonormal; it mirrors where the source is left-handed, or where an axis of
+    two-dimensional data, all zeros, is turned round; translation_mm: (3,). midsagittal: afterwards the
+    lateral coordinate is set to 0, as the paper does with mid-sagittal coils.
     """
 
     rotation: FloatArray = field(default_factory=lambda: np.eye(3))
@@ -56,18 +57,18 @@ class Alignment:
     midsagittal: bool = False
 
     @property
+    def moves(self) -> bool:
+        """Whether anything is turned or shifted, apart from the projection."""
+        return not np.array_equal(self.rotation, np.eye(3)) or bool(self.translation_mm.any())
+
+    @property
     def is_identity(self) -> bool:
-        return bool(
-            np.array_equal(self.rotation, np.eye(3))
-            and not self.translation_mm.any()
-            and not self.midsagittal
-        )
+        return not self.moves and not self.midsagittal
 
     def __str__(self) -> str:
         if self.is_identity:
             return "none: the recording is taken to be in the model's frame"
-        moved = not (np.array_equal(self.rotation, np.eye(3)) and not self.translation_mm.any())
-        parts = [] if not moved else [f"rigid, translation {np.round(self.translation_mm, 2).tolist()} mm"]
+        parts = [f"rigid, translation {np.round(self.translation_mm, 2).tolist()} mm"] if self.moves else []
         return " and ".join(parts + (["projection into the mid-sagittal plane"] if self.midsagittal else []))
 
 
@@ -89,9 +90,12 @@ class Energy:
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
-            if not np.isfinite(value) or value < 0 or (name in ("alpha", "box") and value == 0):
-                least = "above 0" if name in ("alpha", "box") else "0 or more"
-                raise InputError(f"[energy] {name} = {value}: expected a finite number, {least}.")
+            positive = name in ("alpha", "box")
+            if not 0 <= value <= LARGEST_TERM or (positive and value == 0):
+                least = "above 0" if positive else "0 or more"
+                raise InputError(
+                    f"[energy] {name} = {value}: expected a finite number, {least}, of at most {LARGEST_TERM:g}."
+                )
 
 
 @dataclass(frozen=True)
@@ -188,7 +192,7 @@ def _session_from(content: Mapping[str, Any], source: str) -> Session:
         _alignment(_table(content, "alignment")),
         correspondences,
         weights,
-        str(speaker.get("source", "")),
+        _text(speaker.get("source", ""), "[speaker] source"),
         Energy(**{name: _number(value, f"[energy] {name}") for name, value in energy.items()}),
         _text(content.get("model", ""), "model"),
         source,
@@ -252,7 +256,10 @@ def _text(value: Any, where: str) -> str:
 def _number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"{where} = {value!r}: expected a number.")
-    return float(value)
+    try:
+        return float(value)
+    except OverflowError:
+        raise InputError(f"{where}: the number is too large.") from None
 
 
 def _integer(value: Any, where: str) -> int:
@@ -262,11 +269,16 @@ def _integer(value: Any, where: str) -> int:
 
 
 def _numbers(values: Any, shape: tuple[int, ...] | None, where: str) -> FloatArray:
+    """shape: the one it must have; None = a list of at least one."""
     try:
-        array = np.array(values, dtype=np.float64)
-    except (ValueError, TypeError) as reason:
+        listed = np.array(values)
+    except ValueError as reason:  # rows of different lengths
         raise InputError(f"{where}: expected numbers only.") from reason
-    if not np.isfinite(array).all() or (shape is not None and array.shape != shape) or array.ndim == 0:
-        wanted = f" in the shape {shape}" if shape else ""
+    if listed.dtype.kind not in "fiu" and listed.size:
+        raise InputError(f"{where}: expected numbers only.")
+    array = listed.astype(np.float64)
+    fits = array.shape == shape if shape else array.ndim == 1 and array.size > 0
+    if not np.isfinite(array).all() or not fits:
+        wanted = f" in the shape {shape}" if shape else " in one list"
         raise InputError(f"{where}: expected finite numbers{wanted}.")
     return array

@@ -17,6 +17,7 @@ from .correspondences import estimate_correspondences
 from .preparation import Preparation
 from .session import NO_SESSION, Session, axis_mapping
 
+FAR_MM = 15.0  # from its vertex; a coil in the model's frame ends much nearer, whatever the anatomy
 MODEL_FRAME = FrameOfReference("left", "back", "up", "model")
 
 
@@ -56,6 +57,7 @@ def complete_setup(recording: Recording, model: TongueModel, session: Session) -
     _check_speaker(model, session)
 
     stated = {role: session.correspondences[role] for role in roles if role in session.correspondences}
+    _check_vertices(model, stated, session)
     for role in session.correspondences:
         if role not in roles:
             raise InputError(
@@ -64,22 +66,26 @@ def complete_setup(recording: Recording, model: TongueModel, session: Session) -
             )
     if len(stated) == len(roles):
         vertices = tuple(stated[role] for role in roles)
-        _check_vertices(model, stated, session)
-        if session.model_fingerprint and session.model_fingerprint != model.fingerprint:
-            decisions.append(
-                f"note: the session's vertices were chosen on the model {session.model_fingerprint}, "
-                f"this one is {model.fingerprint}"
-            )
     else:
         coils = preparation.all_frames(recording.positions)
         found = estimate_correspondences(model, coils, roles, session.energy)
-        _check_vertices(model, stated, session)
         vertices = tuple(stated.get(role, vertex) for role, vertex in zip(roles, found.vertices, strict=True))
         decisions.append(f"correspondences (estimated): {found}")
+        if max(found.distances_mm) > FAR_MM:
+            decisions.append(
+                f"note: a coil stays {max(found.distances_mm):.0f} mm away from the model even at its best vertex; "
+                "the recording is hardly in the model's frame, which is the session's [alignment]"
+            )
         if stated:
             decisions.append(
                 f"correspondences (session): {', '.join(f'{r} = vertex {v}' for r, v in stated.items())}"
             )
+    of_a_model = "vertices" * bool(stated), "speaker" * (session.speaker_weights is not None)
+    if any(of_a_model) and session.model_fingerprint not in ("", model.fingerprint):
+        decisions.append(
+            f"note: the session's {' and '.join(filter(None, of_a_model))} were chosen on the model "
+            f"{session.model_fingerprint}, this one is {model.fingerprint}"
+        )
     completed = replace(
         session,
         coils=dict(coil_map.roles),
@@ -127,7 +133,7 @@ def _check_vertices(model: TongueModel, stated: dict[str, int], session: Session
 def _frame_hints(recording: Recording, session: Session) -> list[str]:
     """Says what the file's own frame would need, without doing it unasked."""
     known = [recording.frame.x, recording.frame.y, recording.frame.z]
-    if not session.alignment.is_identity:
+    if session.alignment.moves:
         return []
     axes = suggested_axes(recording.frame)
     if axes is None:

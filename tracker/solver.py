@@ -68,6 +68,7 @@ class FreeSpeakerSolver:
     def solve_all(self, coils: FloatArray) -> SolvedFrames:
         """A whole take of coils (frames, n, 3) from a fresh start, in one compiled loop."""
         self.reset()
+        coils = _compilable(coils)
         solved = SolvedFrames.empty(len(coils), len(self.weights), len(self.residuals_mm))
         kernels.track_free_speaker(
             coils, self._base, self._core, self._box, self._energy, False, self.weights, solved.residuals_mm,
@@ -127,6 +128,7 @@ class FixedSpeakerSolver:
     def solve_all(self, coils: FloatArray) -> SolvedFrames:
         """A whole take of coils (frames, n, 3) from a fresh start, in one compiled loop."""
         self.reset()
+        coils = _compilable(coils)
         solved = SolvedFrames.empty(len(coils), len(self.weights), len(self.residuals_mm))
         kernels.track_fixed_speaker(
             coils, self._base, self._directions, self._gram, self._box, self._energy, False, self.weights,
@@ -161,6 +163,11 @@ class SolvedFrames:
         """Frames before the first coil arrived hold nothing: they are lost, not held."""
         tracked = np.flatnonzero(self.statuses == PoseStatus.OK)
         self.statuses[: tracked[0] if len(tracked) else len(self.statuses)] = PoseStatus.LOST
+
+
+def _compilable(frames: FloatArray) -> FloatArray:
+    """The same array where it already has the type that the kernels are compiled for, else a copy."""
+    return np.require(frames, np.float64, ["C_CONTIGUOUS", "WRITEABLE"])
 
 
 def _writable(array: FloatArray) -> FloatArray:
