@@ -18,7 +18,7 @@ from .solver import FixedSpeakerSolver, FreeSpeakerSolver, SolvedFrames
 
 @dataclass(frozen=True)
 class TrackingRun:
-    """What tracking a recording gave. Experiment 1 is None where the session already knew the speaker.
+    """What tracking a recording gave. An experiment that was not asked for is None.
 
     setup: with the speaker's weights, so that `setup.session` reproduces experiment 2.
     """
@@ -48,14 +48,14 @@ def track_recording(
     energy = setup.session.energy
     coils = setup.preparation.all_frames(recording.positions)
     at_coils = model.at(setup.vertices)
+    if np.isnan(coils[:, :, 0]).all():
+        raise InputError(
+            f"{recording.source}: none of the tracked coils ({', '.join(setup.channels)}) has a position in any "
+            "frame; name channels that have, with --coils or in the session's [coils]."
+        )
     free: SolvedFrames | None = None
     if 1 in experiments or setup.session.speaker_weights is None:
         free = FreeSpeakerSolver(at_coils, energy).solve_all(coils)
-        if not (free.statuses == PoseStatus.OK).any():
-            raise InputError(
-                f"{recording.source}: none of the tracked coils ({', '.join(setup.channels)}) has a position in "
-                "any frame."
-            )
     setup = with_speaker(setup, model, free, recording)
     weights = setup.session.speaker_weights
     assert weights is not None
@@ -66,11 +66,7 @@ def track_recording(
 
     def poses(experiment: int, solved: SolvedFrames, speakers: FloatArray, pose: FloatArray) -> TrackedPoses:
         frames = len(coils)
-        held = (
-            energy.beta_speaker * float(np.sum((weights - model.speaker.mean) ** 2))
-            if experiment == 2
-            else 0.0
-        )
+        constant = fixed_speaker_energy(model, setup) if experiment == 2 else 0.0
         fitted = at_coils.origin + np.einsum("tl,tk,lkr->tr", speakers, pose, at_coils.core, optimize=True)
         return TrackedPoses(
             times_s=recording.times_s,
@@ -78,7 +74,7 @@ def track_recording(
             weights=pose,
             normalised=model.pose.normalised(pose),
             speaker_weights=speakers,
-            energies=solved.results[:, 0] + held,
+            energies=solved.results[:, 0] + constant,
             residual_mm=solved.results[:, 1],
             residuals_mm=solved.residuals_mm,
             coils=coils,
@@ -121,6 +117,17 @@ def with_speaker(setup: Setup, model: TongueModel, free: SolvedFrames | None, re
     )
 
 
+def fixed_speaker_energy(model: TongueModel, setup: Setup) -> float:
+    """The bias of the speaker's weights: the part of E that stays while they are fixed; 0 while they are free.
+
+    The fixed speaker's solver leaves it out, as it knows the pose alone.
+    """
+    weights = setup.session.speaker_weights
+    if weights is None:
+        return 0.0
+    return setup.session.energy.beta_speaker * float(np.sum((weights - model.speaker.mean) ** 2))
+
+
 class Tracker:
     """Frame in, pose out: prepares and solves one frame in compiled code, allocating nothing.
 
@@ -139,6 +146,7 @@ class Tracker:
         else:
             self.speaker = model.for_speaker(weights)
             self._solver = FixedSpeakerSolver(self.speaker.at(setup.vertices), setup.session.energy)
+        self._constant_energy = fixed_speaker_energy(model, setup)
         self._mean = model.pose.mean
         self._sigma = model.pose.sigma
         self.pose = TrackedPose(
@@ -156,7 +164,7 @@ class Tracker:
     def warm_up(self) -> None:
         """Compiles or loads the kernels on a frame without coils, so that the first real one is not late."""
         self._solver.solve(np.full_like(self._preparation.coils, np.nan))
-        self._preparation.frame(np.zeros((self._preparation.channels_needed, 3)))
+        self._preparation.frame(np.full((self._preparation.channels_needed, 3), np.nan))
         self.reset()
 
     def reset(self) -> None:
@@ -171,6 +179,7 @@ class Tracker:
         np.subtract(pose.weights, self._mean, out=pose.normalised)
         np.divide(pose.normalised, self._sigma, out=pose.normalised)
         pose.energy, pose.residual_mm = self._solver.result
+        pose.energy += self._constant_energy
         pose.valid_coils = len(coils) - int(np.count_nonzero(np.isnan(coils[:, 0])))
         pose.device_time_s = frame.device_time_s
         pose.frame_number = frame.frame_number
