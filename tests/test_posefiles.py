@@ -1,5 +1,6 @@
 """Poses on disk: what is written is what is read, in three formats."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -47,6 +48,36 @@ def test_csv_and_npz_give_every_number_back_exactly(run, small_model, tmp_path, 
         np.testing.assert_array_equal(getattr(again, name), getattr(poses, name), err_msg=name)
     for name in ("roles", "correspondences", "experiment", "rate_hz", "model_fingerprint", "recording"):
         assert getattr(again, name) == getattr(poses, name)
+
+
+ODD = 'a, "b"\nc\r# d: \u2028\x0c\x85 ə \udcff'
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+@pytest.mark.parametrize("name", [ODD, '"quoted"', " spaces ", "C:\\takes\\new", "a: b", ""])
+def test_any_name_of_a_recording_or_model_comes_back(run, small_model, tmp_path, suffix, name):
+    poses = dataclasses.replace(run.experiment_2, recording=name, model_path=name, model_name=name)
+    write_poses(poses, small_model, tmp_path / f"p{suffix}")
+    again = read_poses(tmp_path / f"p{suffix}")
+    assert (again.recording, again.model_path, again.model_name) == (name, name, name)
+    np.testing.assert_array_equal(again.coils, poses.coils)
+
+
+def test_long_takes_are_written_and_read_in_parts(run, small_model, tmp_path, monkeypatch):
+    write_poses(run.experiment_1, small_model, tmp_path / "whole.csv")
+    monkeypatch.setattr("tonguetrack.tracker.posefiles.CHUNK_FRAMES", 7)
+    write_poses(run.experiment_1, small_model, tmp_path / "parts.csv")
+    assert (tmp_path / "parts.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
+    np.testing.assert_array_equal(read_poses(tmp_path / "parts.csv").coils, run.experiment_1.coils)
+
+
+def test_a_failure_while_writing_leaves_the_old_file(run, small_model, tmp_path):
+    (tmp_path / "p.json").write_text("old")
+    broken = dataclasses.replace(run.experiment_1, times_s=np.full(60, np.nan))
+    with pytest.raises(ValueError, match="JSON"):
+        write_poses(broken, small_model, tmp_path / "p.json")
+    assert [path.name for path in tmp_path.iterdir()] == ["p.json"]
+    assert (tmp_path / "p.json").read_text() == "old"
 
 
 def test_the_csv_tells_a_person_what_it_is(run, small_model, tmp_path):

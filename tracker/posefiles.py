@@ -9,12 +9,13 @@ out of both lists; a frame without any has empty lists and zeros for energy and 
 from __future__ import annotations
 
 import csv
-import io
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, TextIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import InputError
 from ..archive import read_arrays
@@ -26,6 +27,7 @@ POSE_SUFFIXES = (".csv", ".json", ".npz")
 FORMAT_NAME = "tonguetrack poses"
 FORMAT_VERSION = 1
 MAX_POSE_BYTES = 4 * 1024**3
+CHUNK_FRAMES = 4096  # are turned into text, or back, at a time
 _HEADER_FIELDS = ("model_path", "model_fingerprint", "model_name", "recording", "rate_hz", "experiment")
 
 
@@ -41,13 +43,15 @@ def write_poses(poses: TrackedPoses, model: TongueModel, path: str | Path) -> No
     """Writes poses to the format that the suffix names; the file appears whole or not at all."""
     check_pose_suffix(path)
     suffix = Path(path).suffix.lower()
-    if suffix == ".csv":
-        content = _csv_text(poses).encode()
-    elif suffix == ".json":
-        content = authors_json(poses, model).encode()
-    else:
-        content = _npz_bytes(poses)
-    write_atomically(path, content)
+
+    def write(file: BinaryIO) -> None:
+        if suffix == ".npz":
+            _write_npz(poses, file)
+            return
+        parts = _csv_parts(poses) if suffix == ".csv" else _authors_json_parts(poses, model)
+        file.writelines(text.encode() for text in parts)
+
+    write_atomically(path, write)
 
 
 def read_poses(path: str | Path, model: TongueModel | None = None) -> TrackedPoses:
@@ -64,7 +68,8 @@ def read_poses(path: str | Path, model: TongueModel | None = None) -> TrackedPos
     suffix = path.suffix.lower()
     try:
         if suffix == ".csv":
-            return _from_csv(path.read_text(encoding="utf-8"))
+            with path.open(encoding="utf-8", newline="") as file:
+                return _from_csv(file)
         if suffix == ".npz":
             return _from_npz(path.read_bytes())
         return _from_authors_json(json.loads(path.read_text(encoding="utf-8")), model)
@@ -79,27 +84,25 @@ def read_poses(path: str | Path, model: TongueModel | None = None) -> TrackedPos
 # The authors' JSON ----------------------------------------------------------------------------------
 
 
-def authors_json(poses: TrackedPoses, model: TongueModel) -> str:
-    """The poses as the list that the authors' offline tracker writes."""
+def _authors_json_parts(poses: TrackedPoses, model: TongueModel) -> Iterator[str]:
+    """The list that the authors' offline tracker writes, one frame after the other."""
     speaker_variations = model.speaker.normalised(poses.speaker_weights)
-    frames = []
     for t in range(poses.frame_count):
         present = ~np.isnan(poses.coils[t, :, 0])
         fitted = poses.vertices[t][present] if poses.vertices is not None else np.zeros((0, 3))
-        frames.append(
-            {
-                "energy": _or_zero(poses.energies[t]),
-                "error": _or_zero(poses.residual_mm[t]),
-                "timeStamp": float(poses.times_s[t]),
-                "source": [dict(zip("xyz", point)) for point in fitted.tolist()],
-                "target": [dict(zip("xyz", point)) for point in poses.coils[t][present].tolist()],
-                "speakerWeights": poses.speaker_weights[t].tolist(),
-                "speakerVariations": speaker_variations[t].tolist(),
-                "phonemeWeights": poses.weights[t].tolist(),
-                "phonemeVariations": poses.normalised[t].tolist(),
-            }
-        )
-    return json.dumps(frames, allow_nan=False) + "\n"
+        frame = {
+            "energy": _or_zero(poses.energies[t]),
+            "error": _or_zero(poses.residual_mm[t]),
+            "timeStamp": float(poses.times_s[t]),
+            "source": [dict(zip("xyz", point)) for point in fitted.tolist()],
+            "target": [dict(zip("xyz", point)) for point in poses.coils[t][present].tolist()],
+            "speakerWeights": poses.speaker_weights[t].tolist(),
+            "speakerVariations": speaker_variations[t].tolist(),
+            "phonemeWeights": poses.weights[t].tolist(),
+            "phonemeVariations": poses.normalised[t].tolist(),
+        }
+        yield (", " if t else "[") + json.dumps(frame, allow_nan=False)
+    yield "]\n"
 
 
 def _or_zero(value: float) -> float:
@@ -150,61 +153,65 @@ def _from_authors_json(content: Any, model: TongueModel | None) -> TrackedPoses:
 # CSV ------------------------------------------------------------------------------------------------
 
 
-def _csv_text(poses: TrackedPoses) -> str:
+def _csv_parts(poses: TrackedPoses) -> Iterator[str]:
     """Comment lines with what belongs to the whole take, then one row a frame; an empty cell = missing."""
-    stream = io.StringIO()
-    stream.write(f"# {FORMAT_NAME} {FORMAT_VERSION}\n")
+    yield f"# {FORMAT_NAME} {FORMAT_VERSION}\n"
     for name in _HEADER_FIELDS:
-        stream.write(f"# {name}: {getattr(poses, name)}\n")
+        yield f"# {name}: {_one_line(str(getattr(poses, name)))}\n"
     pairs = (f"{role}={vertex}" for role, vertex in zip(poses.roles, poses.correspondences, strict=True))
-    stream.write(f"# correspondences: {' '.join(pairs)}\n")
-    columns, names = _columns(poses)
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["frame", "time_s", "status", *names])
-    for t in range(poses.frame_count):
-        cells = ["" if np.isnan(value) else repr(float(value)) for value in columns[t]]
-        status = PoseStatus(int(poses.statuses[t])).name.lower()
-        writer.writerow([t, repr(float(poses.times_s[t])), status, *cells])
-    return stream.getvalue()
+    yield f"# correspondences: {' '.join(pairs)}\n"
+    yield ",".join(["frame", "time_s", "status", *_column_names(poses)]) + "\n"
+    words = {int(status): status.name.lower() for status in PoseStatus}
+    for begin in range(0, poses.frame_count, CHUNK_FRAMES):
+        part = slice(begin, begin + CHUNK_FRAMES)
+        starts = zip(poses.times_s[part].tolist(), poses.statuses[part].tolist(), strict=True)
+        lines = [
+            f"{t},{time_s!r},{words[status]},{','.join(map(repr, row))}\n"
+            for t, ((time_s, status), row) in enumerate(
+                zip(starts, _columns(poses, part).tolist(), strict=True), begin
+            )
+        ]
+        yield "".join(lines).replace(",nan", ",")
 
 
-def _columns(poses: TrackedPoses) -> tuple[FloatArray, list[str]]:
+def _one_line(text: str) -> str:
+    """The text itself, or a JSON string where it could not stand in one line of a file."""
+    return text if text.isprintable() and not text.startswith('"') else json.dumps(text)
+
+
+def _column_names(poses: TrackedPoses) -> list[str]:
     size, speakers = poses.weights.shape[1], poses.speaker_weights.shape[1]
     names = [f"pose_{k + 1}" for k in range(size)]
     names += [f"pose_{k + 1}_sigma" for k in range(size)]
     names += [f"speaker_{k + 1}" for k in range(speakers)]
     names += ["energy", "residual_mm"]
     names += [f"residual_mm_{role}" for role in poses.roles]
-    names += [f"{role}_{axis}_mm" for role in poses.roles for axis in "xyz"]
-    frames = poses.frame_count
-    parts = [poses.weights, poses.normalised, poses.speaker_weights, poses.energies, poses.residual_mm]
-    parts += [poses.residuals_mm, poses.coils.reshape(frames, -1)]
-    return np.column_stack(parts), names
+    return names + [f"{role}_{axis}_mm" for role in poses.roles for axis in "xyz"]
 
 
-def _from_csv(text: str) -> TrackedPoses:
-    lines = text.splitlines()
-    if not lines or not lines[0].startswith(f"# {FORMAT_NAME} "):
+def _columns(poses: TrackedPoses, part: slice) -> FloatArray:
+    """(frames of the part, columns), in the order of `_column_names`."""
+    columns = [poses.weights, poses.normalised, poses.speaker_weights, poses.energies, poses.residual_mm]
+    columns += [poses.residuals_mm, poses.coils.reshape(poses.frame_count, -1)]
+    return np.column_stack([array[part] for array in columns])
+
+
+def _from_csv(file: TextIO) -> TrackedPoses:
+    first = file.readline()
+    if not first.startswith(f"# {FORMAT_NAME} "):
         raise InputError(
             f"the first line should be '# {FORMAT_NAME} {FORMAT_VERSION}'; this is another kind of CSV."
         )
-    _check_version(lines[0].rsplit(" ", 1)[1])
-    header = dict(line[2:].split(": ", 1) for line in lines[1:] if line.startswith("# ") and ": " in line)
-    rows = list(csv.reader(line for line in lines if not line.startswith("#")))
-    if len(rows) < 2:
-        raise InputError("there are no frames in it.")
-    names, body = rows[0], rows[1:]
-    for number, row in enumerate(body):
-        if len(row) != len(names):
-            raise InputError(
-                f"frame {number} has {len(row)} cells, expected {len(names)}; is the file cut off?"
-            )
+    _check_version(first.split()[-1])
+    header: dict[str, str] = {}
+    line = file.readline()
+    while line.startswith("#"):
+        name, _, text = line[2:].rstrip("\r\n").partition(": ")
+        header[name] = json.loads(text) if text.startswith('"') else text
+        line = file.readline()
+    names = next(csv.reader([line]), [])
+    statuses, table = _read_rows(file, len(names))
     column = {name: index for index, name in enumerate(names)}
-    table = np.array(
-        [[float(cell) if cell else np.nan for cell in [*row[:2], *row[3:]]] for row in body], dtype=np.float64
-    )
-    table = np.insert(table, 2, 0.0, axis=1)
-    statuses = np.array([PoseStatus[row[2].upper()] for row in body], dtype=np.int64)
     pairs = dict(pair.split("=") for pair in header.get("correspondences", "").split())
     roles = tuple(pairs)
 
@@ -223,7 +230,9 @@ def _from_csv(text: str) -> TrackedPoses:
         energies=table[:, column["energy"]],
         residual_mm=table[:, column["residual_mm"]],
         residuals_mm=table[:, [column[f"residual_mm_{role}"] for role in roles]],
-        coils=table[:, [column[f"{r}_{axis}_mm"] for r in roles for axis in "xyz"]].reshape(len(body), -1, 3),
+        coils=table[:, [column[f"{r}_{axis}_mm"] for r in roles for axis in "xyz"]].reshape(
+            len(table), -1, 3
+        ),
         vertices=None,
         roles=roles,
         correspondences=tuple(int(vertex) for vertex in pairs.values()),
@@ -236,6 +245,29 @@ def _from_csv(text: str) -> TrackedPoses:
     )
 
 
+def _read_rows(file: TextIO, width: int) -> tuple[NDArray[np.int64], FloatArray]:
+    """statuses (frames,); table (frames, width), whose third column, the status, is NaN."""
+    statuses: list[int] = []
+    chunks: list[FloatArray] = []
+    rows: list[list[float]] = []
+    for row in csv.reader(file):
+        if len(row) != width:
+            raise InputError(
+                f"frame {len(statuses)} has {len(row)} cells, expected {width}; is the file cut off?"
+            )
+        statuses.append(PoseStatus[row[2].upper()])
+        row[2] = ""
+        rows.append([float(cell) if cell else np.nan for cell in row])
+        if len(rows) == CHUNK_FRAMES:
+            chunks.append(np.array(rows))
+            rows.clear()
+    if not statuses:
+        raise InputError("there are no frames in it.")
+    if rows:
+        chunks.append(np.array(rows))
+    return np.array(statuses, dtype=np.int64), np.concatenate(chunks)
+
+
 # NPZ ------------------------------------------------------------------------------------------------
 
 _ARRAYS = (
@@ -244,15 +276,13 @@ _ARRAYS = (
 )  # fmt: skip
 
 
-def _npz_bytes(poses: TrackedPoses) -> bytes:
+def _write_npz(poses: TrackedPoses, file: BinaryIO) -> None:
     header: dict[str, Any] = {"format": FORMAT_NAME, "version": FORMAT_VERSION}
     header.update({name: getattr(poses, name) for name in _HEADER_FIELDS})
     header.update(roles=list(poses.roles), correspondences=list(poses.correspondences))
     arrays = {name: getattr(poses, name) for name in _ARRAYS if getattr(poses, name) is not None}
-    stream = io.BytesIO()
-    coded = np.frombuffer(json.dumps(header, ensure_ascii=False).encode(), dtype=np.uint8)
-    np.savez_compressed(stream, header=coded, **arrays)
-    return stream.getvalue()
+    coded = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    np.savez_compressed(file, header=coded, **arrays)
 
 
 def _from_npz(data: bytes) -> TrackedPoses:
