@@ -168,7 +168,7 @@ def _model_from_npz(data: bytes) -> TongueModel:
         tuple(map(int, header["midsagittal"])),
     )
     provenance = {str(k): str(v) for k, v in header["provenance"].items()}
-    faces = numbers("faces", 2).astype(np.int32)
+    faces = _indices(numbers("faces", 2), "faces")
     model = TongueModel(
         numbers("core", 3), numbers("origin", 1), faces, mode("speaker"), mode("pose"), marks, provenance
     )
@@ -225,7 +225,9 @@ def _model_from_published(content: Any, name: str) -> TongueModel:
     model = TongueModel(
         core.reshape(shape),
         _numbers(content["ShapeSpace"]["Origin"], "ShapeSpace/Origin"),
-        _numbers(content["ShapeSpace"]["Faces"], "ShapeSpace/Faces").astype(np.int32).reshape(-1, 3),
+        _indices(_numbers(content["ShapeSpace"]["Faces"], "ShapeSpace/Faces"), "ShapeSpace/Faces").reshape(
+            -1, 3
+        ),
         Mode(_numbers(means["SpeakerMode"], "MeanWeights/SpeakerMode"), sizes["OriginalSpeakerMode"]),
         Mode(_numbers(means["PhonemeMode"], "MeanWeights/PhonemeMode"), sizes["OriginalPhonemeMode"]),
         provenance={"name": name, "source": f"published model file {name}"},
@@ -236,16 +238,25 @@ def _model_from_published(content: Any, name: str) -> TongueModel:
 def _core_values(stored: Any) -> FloatArray:
     if not isinstance(stored, (bytes, str)):
         return _numbers(stored, "CoreTensor").ravel()
-    raw = stored if isinstance(stored, bytes) else base64.b64decode(stored, validate=True)
+    raw = stored if isinstance(stored, bytes) else base64.b64decode("".join(stored.split()), validate=True)
     if len(raw) % 8:
         raise InputError(f"CoreTensor holds {len(raw)} bytes, which is no whole number of 8-byte doubles.")
     # "Native order of the writer" is little-endian on every machine in use; a file from the other
     # kind shows itself by values no tongue can have.
-    for order in ("<f8", ">f8"):
-        values = np.frombuffer(raw, dtype=order).astype(np.float64)
-        if np.isfinite(values).all() and (values.size == 0 or 1e-6 < np.abs(values).max() < 1e6):
-            return np.asarray(values)
-    raise InputError("CoreTensor holds no plausible doubles in either byte order.")
+    little, big = (np.frombuffer(raw, dtype=order).astype(np.float64) for order in ("<f8", ">f8"))
+    return big if _plausible(big) and not _plausible(little) else little
+
+
+def _plausible(core: FloatArray) -> bool:
+    return bool(np.isfinite(core).all() and core.size and 1e-6 < np.abs(core).max() < 1e6)
+
+
+def _indices(values: FloatArray, where: str) -> NDArray[np.int32]:
+    if not (
+        np.isfinite(values).all() and (values == np.rint(values)).all() and (np.abs(values) < 2**31).all()
+    ):
+        raise InputError(f"{where} should hold vertex numbers: whole, and none too large.")
+    return values.astype(np.int32)
 
 
 def _numbers(values: ArrayLike, where: str) -> FloatArray:
@@ -261,8 +272,9 @@ def _checked(model: TongueModel) -> TongueModel:
         if not np.isfinite(getattr(model, name)).all():
             raise InputError(f"the model's {name} holds values that are not finite numbers.")
     for mode in (model.speaker, model.pose):
-        if not np.isfinite(mode.mean).all():
-            raise InputError("the model's mean weights hold values that are not finite numbers.")
+        for array in (mode.mean, mode.training, mode.spectrum):
+            if array is not None and not np.isfinite(array).all():
+                raise InputError("the model's weights hold values that are not finite numbers.")
     if model.faces.ndim != 2 or model.faces.shape[1:] != (3,):
         raise InputError(f"the model's faces have shape {model.faces.shape}, expected (faces, 3).")
     marks = [*model.marks.midsagittal, *model.marks.landmarks.values()]
@@ -270,8 +282,9 @@ def _checked(model: TongueModel) -> TongueModel:
         marks.extend(vertices)
     used = np.concatenate([model.faces.ravel(), np.asarray(marks, dtype=np.int64)])
     if used.size and (used.min() < 0 or used.max() >= model.vertex_count):
+        wrong = used.min() if used.min() < 0 else used.max()
         raise InputError(
-            f"a face or a mark names vertex {used.max()}, but the model has {model.vertex_count} vertices."
+            f"a face or a mark names vertex {wrong}, but the model has {model.vertex_count} vertices, from 0."
         )
     return model
 

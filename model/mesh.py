@@ -53,8 +53,9 @@ def read_mesh(path: str | Path) -> Mesh:
             f"{path}: vertex {int(np.argmin(np.isfinite(vertices).all(axis=1)))} is not a number."
         )
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        wrong = faces.min() if faces.min() < 0 else faces.max()
         raise InputError(
-            f"{path}: a face names vertex {faces.max()}, but there are {len(vertices)} vertices."
+            f"{path}: a face names vertex {wrong}, but there are {len(vertices)} vertices, from 0."
         )
     return Mesh(vertices, faces)
 

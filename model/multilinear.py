@@ -50,6 +50,12 @@ class Mode:
                 f"a mode's training weights have shape {self.training.shape}, "
                 f"expected ({self.entries}, {len(self.mean)})."
             )
+        if self.spectrum is not None and self.spectrum.shape != (self.entries,):
+            raise InputError(
+                f"a mode's spectrum has shape {self.spectrum.shape}, expected ({self.entries},)."
+            )
+        if self.names and len(self.names) != self.entries:
+            raise InputError(f"a mode has {len(self.names)} names for {self.entries} training entries.")
 
     @property
     def size(self) -> int:

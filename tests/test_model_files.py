@@ -1,6 +1,7 @@
 """Model files: our .npz, the published YAML and JSON, and what is not a model."""
 
 import base64
+import dataclasses
 import json
 import zipfile
 
@@ -50,6 +51,56 @@ def test_conversion_there_and_back_is_exact_to_the_last_bit(small_model, tmp_pat
     assert model.fingerprint == small_model.fingerprint
     np.testing.assert_array_equal(model.core, small_model.core)
     np.testing.assert_array_equal(model.speaker.mean, small_model.speaker.mean)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".yaml", ".json"])
+@pytest.mark.parametrize("scale", [1.0, 1e-300, 1e12])
+def test_subnormal_huge_and_negative_zero_keep_their_bits(small_model, tmp_path, suffix, scale):
+    core, origin = small_model.core * scale, np.array(small_model.origin)
+    core[0, 0, :4] = [5e-324, -0.0, -2.2e-308, 1e-5 * scale]
+    origin[:5] = [1e-5, -0.0, 5e-324, 1e22, 3.0]
+    odd = dataclasses.replace(small_model, core=core, origin=origin)
+    save_model(odd, tmp_path / f"m{suffix}")
+    again = load_model(tmp_path / f"m{suffix}")
+    assert again.core.tobytes() == core.tobytes()
+    assert again.origin.tobytes() == origin.tobytes()
+
+
+def test_a_yaml_as_others_write_it_is_read(small_model, tmp_path):
+    """Another key order, block lists, whole numbers, exponents without a dot, a wrapped base64 string."""
+    content = json.loads(model_bytes(small_model, ".json"))
+    encoded = base64.encodebytes(small_model.core.tobytes()).decode()
+    lines = ["ShapeSpace:", "  Faces:"]
+    lines += [f"    - [{a}, {b}, {c}]" for a, b, c in content["ShapeSpace"]["Faces"]]
+    lines += [
+        "  Origin:",
+        *(f"    - {value}" for value in ["1e-05", "-3", "2E+2", *content["ShapeSpace"]["Origin"][3:]]),
+    ]
+    lines += ["CoreTensor: |", *(f"  {line}" for line in encoded.split()), "MeanWeights:"]
+    lines += [f"  {name}: {values}" for name, values in reversed(content["MeanWeights"].items())]
+    lines += ["Dimensions:", *(f"  {name}: {size}" for name, size in reversed(content["Dimensions"].items()))]
+    (tmp_path / "m.yaml").write_text("\n".join(lines) + "\n")
+    again = load_model(tmp_path / "m.yaml")
+    np.testing.assert_array_equal(again.core, small_model.core)
+    np.testing.assert_array_equal(again.speaker.mean, small_model.speaker.mean)
+    np.testing.assert_array_equal(again.origin, [1e-5, -3.0, 200.0, *small_model.origin[3:]])
+
+
+@pytest.mark.parametrize(
+    ("face", "sentence"),
+    [
+        ([0, 1, 1.5], "should hold vertex numbers"),
+        ([0, 1, 2**32], "should hold vertex numbers"),
+        ([0, 1, -1], "names vertex -1, but the model has 60 vertices, from 0"),
+        ([0, 1, 60], "names vertex 60"),
+    ],
+)
+def test_a_face_of_what_is_no_vertex_is_refused(small_model, tmp_path, face, sentence):
+    content = json.loads(model_bytes(small_model, ".json"))
+    content["ShapeSpace"]["Faces"][3] = face
+    (tmp_path / "m.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=sentence):
+        load_model(tmp_path / "m.json")
 
 
 def test_the_published_layout_is_speaker_major(small_model):
