@@ -134,8 +134,16 @@ def simulate(simulation: Simulation) -> tuple[Recording, Truth]:
     # The surface is evaluated at the control rate; speech moves slowly enough for splines between.
     control = np.arange(0.0, times[-1] + 2.0 / CONTROL_RATE_HZ, 1.0 / CONTROL_RATE_HZ)
     targets = [articulation_for(anatomy, phone, habits) for phone in phones]
-    shapes = [tongue_surface(anatomy, _articulation_at(t, targets, simulation.phone_s)) for t in control]
-    sampled = np.array([[shape[vertices[role]] for role in vertices] for shape in shapes])
+    # Of each shape only the coils' and, now and then, the contour's points are kept: an hour has 360,000.
+    midsagittal = list(tongue_template().midsagittal)
+    every = max(1, round(CONTROL_RATE_HZ / CONTOUR_RATE_HZ))
+    sampled = np.empty((len(control), len(vertices), 3))
+    contours = np.empty((len(control[::every]), len(midsagittal), 3))
+    for index, t in enumerate(control):
+        shape = tongue_surface(anatomy, _articulation_at(t, targets, simulation.phone_s))
+        sampled[index] = shape[list(vertices.values())]
+        if index % every == 0:
+            contours[index // every] = shape[midsagittal]
     moving = CubicSpline(control, sampled.reshape(len(control), -1))(times).reshape(count, -1, 3)
 
     positions = np.empty((count, len(simulation.coils), 3))
@@ -149,11 +157,9 @@ def simulate(simulation: Simulation) -> tuple[Recording, Truth]:
     recorded = np.round(recorded, RECORDED_DECIMALS)
     recorded[_dropouts(simulation, count, random)] = np.nan
 
-    every = max(1, round(CONTROL_RATE_HZ / CONTOUR_RATE_HZ))
-    midsagittal = list(tongue_template().midsagittal)
     truth = Truth(
         vertices, positions, rotation, translation, starts, phones, control[::every],
-        np.array([shape[midsagittal] for shape in shapes[::every]]), anatomy, habits,
+        contours, anatomy, habits,
     )  # fmt: skip
     moved = "after head motion" if simulation.head_motion else "the model's"
     recording = Recording(
