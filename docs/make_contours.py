@@ -36,7 +36,7 @@ def main() -> None:
         "Synthetic speakers (not anatomy): 13 phones each, palate in black; mm, front to the left"
     )
     figure.tight_layout()
-    figure.savefig(TARGET, dpi=70)
+    figure.savefig(TARGET, dpi=58)
     print(f"{TARGET}: {TARGET.stat().st_size} bytes")
 
 

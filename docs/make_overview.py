@@ -14,7 +14,7 @@ from tonguetrack.tracker.bundled import bundled_model, bundled_recording
 
 from tonguetrack import track_recording
 
-FRAME = 1180
+FRAME = 610
 COIL, SKIN = "#d9480f", "#e8a89a"
 
 

@@ -99,10 +99,10 @@ def test_landmarks_regions_and_midline_are_where_their_names_say(reference_shape
     assert {"Tip", "SurfaceCenter", "BackCenter", "Airway", "FrontBaseCenter"} <= set(TEMPLATE.landmarks)
     y = reference_shape[:, 1]
     assert y[TEMPLATE.landmarks["Tip"]] == pytest.approx(y.min(), abs=0.5)
-    order = [np.mean(y[list(TEMPLATE.regions[name])]) for name in ("tip", "blade", "dorsum", "back")]
+    order = [np.mean(y[list(TEMPLATE.regions[name])]) for name in ("tip", "blade", "back", "dorsum")]
     assert order == sorted(order)
     assert np.abs(reference_shape[list(TEMPLATE.regions["lateral"]), 0]).min() > 7
-    named = [set(TEMPLATE.regions[name]) for name in ("tip", "blade", "dorsum", "back", "lateral")]
+    named = [set(TEMPLATE.regions[name]) for name in ("tip", "blade", "back", "dorsum", "lateral")]
     assert set().union(*named) == set(TEMPLATE.regions["combined"])
     assert sum(map(len, named)) == len(TEMPLATE.regions["combined"])
     assert TEMPLATE.midsagittal[0] == TEMPLATE.landmarks["Tip"]

@@ -42,8 +42,8 @@ COLUMNS = 49
 REFERENCE_SECTION = (23.0, 34.0, 1.65)
 TIP_REACH_MM = 5.0
 BLADE_REACH_MM = 18.0
-DORSUM_REACH_MM = 48.0
-BACK_REACH_MM = 78.0
+BACK_REACH_MM = 48.0
+DORSUM_REACH_MM = 78.0
 SIDE_ANGLE = 50.0
 LOWEST_SIDE_ANGLE = 78.0
 
@@ -153,7 +153,10 @@ def _faces(grid: NDArray[np.intp]) -> IndexArray:
 
 
 def _regions(grid: NDArray[np.intp], beyond_tip: FloatArray, theta: FloatArray) -> dict[str, tuple[int, ...]]:
-    """The speech-related regions on the upper surface, by distance from the tip and by angle."""
+    """The speech-related regions on the upper surface, by distance from the tip and by angle.
+
+    The order is that of the published meshes' lists: tip, blade, back, and the dorsum behind it.
+    """
     upper = np.abs(theta) <= SIDE_ANGLE
     side = (np.abs(theta) > SIDE_ANGLE) & (np.abs(theta) <= LOWEST_SIDE_ANGLE)
 
@@ -164,9 +167,9 @@ def _regions(grid: NDArray[np.intp], beyond_tip: FloatArray, theta: FloatArray) 
     regions = {
         "tip": pick(-TIP_REACH_MM, TIP_REACH_MM, upper),
         "blade": pick(TIP_REACH_MM, BLADE_REACH_MM, upper),
-        "dorsum": pick(BLADE_REACH_MM, DORSUM_REACH_MM, upper),
-        "back": pick(DORSUM_REACH_MM, BACK_REACH_MM, upper),
-        "lateral": pick(TIP_REACH_MM, DORSUM_REACH_MM, side),
+        "back": pick(BLADE_REACH_MM, BACK_REACH_MM, upper),
+        "dorsum": pick(BACK_REACH_MM, DORSUM_REACH_MM, upper),
+        "lateral": pick(TIP_REACH_MM, BACK_REACH_MM, side),
     }
     regions["combined"] = tuple(sorted(set().union(*regions.values())))
     return regions
