@@ -190,6 +190,14 @@ def test_names_of_the_field_become_roles_and_distance_decides_what_tb_means():
         }
 
 
+def test_tr_is_the_right_side_beside_tl_and_the_root_without():
+    take = recording_of(["TT", "TB", "TR"], [[[0, 5.0, 0], [0, 20.0, 5], [0, 35.0, 3]]])
+    assert guess_coil_map(take.coils, take.positions, "take").roles["TR"] == "tongue_dorsum"
+    take = recording_of(["TT", "TB", "TR", "TL"], [[[0, 5.0, 0], [0, 20.0, 5], [-9, 20.0, 3], [9, 20.0, 3]]])
+    roles = guess_coil_map(take.coils, take.positions, "take").roles
+    assert roles == {"TT": "tongue_tip", "TB": "tongue_dorsum", "TL": "tongue_left", "TR": "tongue_right"}
+
+
 def test_a_channel_without_data_gets_no_role():
     positions = np.array([[[0, 5.0, 0], [np.nan] * 3, [0, 30.0, 3]]])
     take = recording_of(["TT", "TB", "TD"], positions)

@@ -108,6 +108,8 @@ def guess_coil_map(coils: Sequence[str], positions: FloatArray, source: str) -> 
     """
     simple = {name: re.sub(r"[^a-z0-9]", "", name.lower()) for name in coils}
     live = {name for index, name in enumerate(coils) if np.isfinite(positions[:, index]).all(axis=1).any()}
+    if {"tl", "tr"} <= {simple[name] for name in live}:  # the two sides; without a left one, TR is the root
+        simple = {name: "tongueright" if word == "tr" else word for name, word in simple.items()}
     tips = [name for name in coils if simple[name] in _TIP_NAMES and name in live]
     others = [name for name in coils if simple[name] in _TONGUE_NAMES and name in live]
     if len(tips) != 1 or len(others) > 3:

@@ -41,7 +41,7 @@ OPTIONS: dict[str, Any] = {"cache": True, "inline": "never", "error_model": "num
 RELATIVE_DECREASE = 1e-12
 EXACT_NEWTON_DECREASE = 1e-7
 KEPT_PROMISE = 0.05
-MAX_NEWTON_STEPS = 200
+MAX_NEWTON_STEPS = 500  # ordinary frames take 3 to 5, the worst of curved valleys some hundred
 MAX_ACTIVE_SET_STEPS = 200
 # Gauss-Newton is cheap far from the minimum, but only linear near it where residuals are large.
 GAUSS_NEWTON_STEPS = 6
