@@ -218,6 +218,21 @@ def test_the_readmes_commands_run_one_after_the_other(newcomer):
     assert re.fullmatch(r"\(\d+, \d+\) [\d.]+\n", done.stdout)
 
 
+def test_python_started_in_the_checkout_finds_the_whole_package(tmp_path):
+    shutil.copytree(ROOT / "tonguetrack", tmp_path / "tonguetrack")
+    for folder in ("model", "drivers", "tracker", "recordings"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    program = (
+        "import sys; sys.meta_path[:] = [f for f in sys.meta_path if 'ditable' not in repr(f)]; import tonguetrack; "
+        "print(tonguetrack.load_model.__module__, tonguetrack.__file__)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["tonguetrack.model.files", str(tmp_path / "tonguetrack" / "__init__.py")]
+
+
 def test_the_docs_commands_run(newcomer):
     for page in doc_pages():
         if any(DOCS[command] == HERE for command in commands(page)):

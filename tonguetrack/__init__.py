@@ -3,10 +3,17 @@
 The public names below are loaded when first used, so that importing the package stays instant.
 """
 
+import os
 from importlib import import_module
 from typing import Any
 
 __version__ = "0.1.0"
+
+# Python started in the checkout finds this folder before the installed package. There, the other
+# folders of the package are neighbours of this one.
+_HERE = os.path.dirname(os.path.abspath(__file__))
+if not os.path.isdir(os.path.join(_HERE, "model")):
+    __path__.append(os.path.dirname(_HERE))
 
 
 class InputError(ValueError):

@@ -285,6 +285,7 @@ def loop_latency(model: TongueModel, rate_hz: float, seconds: float) -> dict[str
 def start_times(model_path: Path) -> dict[str, Any]:
     """Fresh processes: from nothing to the first tracked frame, with an empty and with a filled cache of
     compiled code. In s."""
+    # -P: of the installed package, also where the working folder is the checkout.
     code = f"from {__name__} import first_frame; first_frame()"
     with tempfile.TemporaryDirectory() as cache:
         environment = {**os.environ, "NUMBA_CACHE_DIR": cache}
@@ -292,7 +293,7 @@ def start_times(model_path: Path) -> dict[str, Any]:
         for name in ("cold", "warm"):
             begin = time.time()
             run = subprocess.run(
-                [sys.executable, "-c", code, str(model_path), repr(begin)],
+                [sys.executable, "-P", "-c", code, str(model_path), repr(begin)],
                 env=environment,
                 capture_output=True,
                 text=True,
