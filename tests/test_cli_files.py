@@ -116,6 +116,15 @@ def test_convert_refuses_before_it_reads_or_writes(run, take, tmp_path):
     assert os.listdir(tmp_path) == ["take.csv"]
 
 
+def test_convert_never_writes_over_what_it_reads(run, take, tmp_path):
+    before = take.read_bytes()
+    (tmp_path / "link.csv").symlink_to(take)
+    for name in ("take.csv", "link.csv"):
+        with pytest.raises(InputError, match="would be overwritten"):
+            run("convert", take, tmp_path / name)
+    assert take.read_bytes() == before
+
+
 def test_real_recordings_convert_and_come_back(run, reference_data, tmp_path):
     for file in ("ag501_reidy/0021.pos", "ndi_wave_ematoblender/Example3.tsv", "emu_webapp/ssff/0020.t_tip"):
         original = open_recording(reference_data / "recordings" / file)

@@ -105,9 +105,70 @@ def test_a_folder_is_searched_and_one_bad_file_does_not_stop_the_rest(place, cap
     assert run("track", "corpus", "--model", "model.npz", "--out", "poses/{name}.csv", "--json") == 2
     captured = capsys.readouterr()
     assert sorted(path.name for path in (place / "poses").iterdir()) == ["a.csv", "c.csv"]
-    assert "1 of 3 recordings could not be tracked" in captured.err
+    assert "1 of 3 recordings could not be tracked: b.csv" in captured.err
     assert "left out: corpus/notes.txt" in captured.err
     assert [("error" in entry) for entry in json.loads(captured.out)["recordings"]] == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    "flags", [("--out", "take.csv"), ("--out", "."), ("--out", "./{name}.csv"), ("--out", "link.csv"),
+              ("--out", "model.npz"), ("--save-session", "take.csv")],
+)  # fmt: skip
+def test_what_is_read_is_never_written_over(place, flags, capsys):
+    (place / "link.csv").symlink_to(place / "take.csv")
+    before = {name: (place / name).read_bytes() for name in ("take.csv", "model.npz")}
+    assert run("track", "take.csv", "--model", "model.npz", *flags) == 2
+    assert "this file is read here and would be overwritten" in capsys.readouterr().err
+    assert {name: (place / name).read_bytes() for name in before} == before
+
+
+def test_a_folder_tracked_into_itself_keeps_its_recordings(place, capsys):
+    (place / "corpus").mkdir()
+    for name in ("a.csv", "b.csv"):
+        (place / "corpus" / name).write_text((place / "take.csv").read_text())
+    assert run("track", "corpus", "--model", "model.npz", "--out", "corpus") == 2
+    assert "corpus/a.csv: this file is read here" in capsys.readouterr().err
+    assert (place / "corpus" / "a.csv").read_text() == (place / "take.csv").read_text()
+
+
+def test_a_session_may_be_written_over_with_what_was_found(place):
+    assert (
+        run("track", "take.csv", "--model", "model.npz", "--session", "s.toml", "--save-session", "s.toml")
+        == 0
+    )
+    assert "[speaker]" in (place / "s.toml").read_text()
+
+
+def test_a_session_that_cannot_be_saved_is_said_before_the_work(place, capsys):
+    (place / "file").write_text("")
+    arguments = ("track", "take.csv", "--model", "model.npz", "--out", "p.csv")
+    assert run(*arguments, "--save-session", "file/s.toml") == 2
+    assert "the folder file cannot be made" in capsys.readouterr().err
+    assert not (place / "p.csv").exists()
+
+
+def test_models_are_not_converted_onto_themselves(place, capsys):
+    before = (place / "model.npz").read_bytes()
+    assert run("model", "convert", "model.npz", "model.npz") == 2
+    assert "would be overwritten" in capsys.readouterr().err
+    assert (place / "model.npz").read_bytes() == before
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252"])
+@pytest.mark.parametrize(
+    "arguments", [("simulate", "recording", "--help"), ("model", "info", "bundled"),
+                  ("model", "info", "--json", "bundled"), ("info", "\u0259.csv"), ("info", "--json", "\u0259.csv")],
+)  # fmt: skip
+def test_a_terminal_without_phonetic_letters_shows_their_numbers(place, encoding, arguments):
+    (place / "take.csv").rename(place / "\u0259.csv")
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; from tonguetrack.tracker.cli import main; sys.exit(main())", *arguments],
+        env={**os.environ, "PYTHONIOENCODING": encoding}, capture_output=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"\\u02" in done.stdout
+    if "--json" in arguments:
+        json.loads(done.stdout.decode(encoding))
 
 
 def test_recordings_of_one_name_are_not_written_over_each_other(place, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import sys
 from collections.abc import Sequence
 
@@ -28,6 +29,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command. Bad input is one sentence on stderr and exit code 2."""
+    _show_what_the_terminal_cannot()
     args = build_parser().parse_args(arguments)
     try:
         return int(args.run(args))
@@ -44,3 +46,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("tonguetrack: stopped.", file=sys.stderr)
         return 130
     return EXIT_BAD_INPUT
+
+
+def _show_what_the_terminal_cannot() -> None:
+    """Letters that the terminal's encoding lacks (phones, names of files) come out as \\u0259, not as an error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")

@@ -7,6 +7,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .names import add_recording_flags, keep_apart
+
 if TYPE_CHECKING:
     from ...drivers import Recording
     from ...drivers.files import Found
@@ -17,20 +19,14 @@ def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]
     info = subparsers.add_parser("info", help="what a recording, or a folder of recordings, holds")
     info.add_argument("file", help="a recording of any known format, or a folder")
     info.add_argument("--json", action="store_true", help="the same as JSON, for scripts")
-    _add_reading_flags(info)
+    add_recording_flags(info)
     info.set_defaults(run=run_info)
 
     convert = subparsers.add_parser("convert", help="write a recording as .csv, .json or .npz")
     convert.add_argument("input", help="a recording of any known format")
     convert.add_argument("output", help="the file to write: .csv, .json (the authors' EMA format) or .npz")
-    _add_reading_flags(convert)
+    add_recording_flags(convert)
     convert.set_defaults(run=run_convert)
-
-
-def _add_reading_flags(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--rate", type=float, metavar="HZ", help="sampling rate, where the file states none")
-    parser.add_argument("--unit", help="unit of positions, where the file states none: m dm cm mm 10um um")
-    parser.add_argument("--layout", help="vector or angles (AG500 .pos without header); raw or filt (SSFF)")
 
 
 def _open(path: str, args: argparse.Namespace) -> Recording:
@@ -60,6 +56,7 @@ def run_convert(args: argparse.Namespace) -> int:
     from ...drivers.files.writing import check_target
 
     check_target(args.output)
+    keep_apart([Path(args.output)], [Path(args.input)])
     recording = _open(args.input, args)
     write_recording(recording, args.output)
     print(

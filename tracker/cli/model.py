@@ -39,8 +39,8 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     info.set_defaults(run=run_info)
 
     convert = verbs.add_parser("convert", help="between our .npz and the published .yaml and .json")
-    convert.add_argument("source", metavar="A")
-    convert.add_argument("target", metavar="B")
+    convert.add_argument("source", metavar="MODEL", help="a model file, or 'bundled'")
+    convert.add_argument("target", metavar="OUT", help="the file to write: .npz, .yaml or .json")
     convert.set_defaults(run=run_convert)
 
     synthetic = verbs.add_parser(
@@ -96,7 +96,7 @@ def run_info(args: argparse.Namespace) -> int:
 
     description = describe_model(named_model(args.model), args.model)
     if args.json:
-        print(json.dumps(description, ensure_ascii=False))
+        print(json.dumps(description))
     else:
         _print_description(description)
     return 0
@@ -106,9 +106,10 @@ def run_convert(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from ...model.files import check_model_suffix, save_model
-    from .names import named_model
+    from .names import keep_apart, named_model
 
     check_model_suffix(args.target)
+    keep_apart([Path(args.target)], [Path(args.source)])
     model = named_model(args.source)
     save_model(model, args.target)
     if Path(args.source).suffix.lower() == ".npz" and Path(args.target).suffix.lower() != ".npz":

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,8 +27,36 @@ def named_model(name: str) -> TongueModel:
     return load_model(name)
 
 
+def keep_apart(outputs: Iterable[Path], sources: Iterable[Path]) -> None:
+    """Refuses an output that is one of the files that are read, by whatever name."""
+    read = {(found.st_dev, found.st_ino) for found in map(_found, sources) if found}
+    for file in outputs:
+        found = _found(file)
+        if found and (found.st_dev, found.st_ino) in read:
+            raise InputError(f"{file}: this file is read here and would be overwritten; choose another name.")
+
+
+def _found(file: Path) -> os.stat_result | None:
+    try:
+        return file.stat()
+    except (OSError, ValueError):
+        return None
+
+
 def prepare_folder(file: Path) -> None:
     """Makes the folder of an output and checks that it can be written to, before the work is done."""
-    file.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{file}: the folder {file.parent} cannot be made ({error.strerror}); choose another place."
+        ) from error
     if not os.access(file.parent, os.W_OK):
         raise InputError(f"{file}: no permission to write in {file.parent}; choose another place.")
+
+
+def add_recording_flags(parser: argparse.ArgumentParser) -> None:
+    """What a person may have to say about a file that does not say it itself."""
+    parser.add_argument("--rate", type=float, metavar="HZ", help="sampling rate, where the file states none")
+    parser.add_argument("--unit", help="unit of positions, where the file states none: m dm cm mm 10um um")
+    parser.add_argument("--layout", help="vector or angles (AG500 .pos without header); raw or filt (SSFF)")

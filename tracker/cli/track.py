@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ... import InputError
-from .names import BUNDLED, named_model, prepare_folder
+from .names import BUNDLED, add_recording_flags, keep_apart, named_model, prepare_folder
 
 if TYPE_CHECKING:
     from ...drivers.frames import Recording
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from ..pose import TrackedPoses
     from ..session import Session
     from ..tracking import TrackingRun
+
+MAX_NAMED = 20
+"""At the end of a long run, at most so many recordings that failed are named again."""
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -57,17 +60,6 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     mesh.set_defaults(run=run_mesh)
 
 
-def add_recording_flags(parser: argparse.ArgumentParser) -> None:
-    """What a person may have to say about a file that does not say it itself."""
-    parser.add_argument(
-        "--rate", type=float, metavar="HZ", help="the sampling rate, where the file does not state it"
-    )
-    parser.add_argument(
-        "--unit", help="the unit of positions, where the file does not state it (mm, cm, m, um)"
-    )
-    parser.add_argument("--layout", help="the column layout, where the format leaves it open")
-
-
 # track ----------------------------------------------------------------------------------------------
 
 
@@ -96,7 +88,11 @@ def run_track(args: argparse.Namespace) -> int:
     print(f"model: {model.name} [{model.fingerprint}]", file=sys.stderr)
     for path, reason in left_out:
         print(f"left out: {path}: {reason}", file=sys.stderr)
-    for file in (output for job in jobs for output in job.outputs.values()):
+    outputs = [output for job in jobs for output in job.outputs.values()]
+    if args.save_session:  # which may well replace --session
+        outputs.append(Path(args.save_session))
+    keep_apart(outputs, [*(job.path for job in jobs), Path(args.model)])
+    for file in outputs:
         prepare_folder(file)
 
     reports: list[dict[str, Any]] = []
@@ -117,7 +113,12 @@ def run_track(args: argparse.Namespace) -> int:
             json.dumps({"model": model.name, "model_fingerprint": model.fingerprint, "recordings": reports})
         )
     if failures:
-        print(f"tonguetrack: {failures} of {len(jobs)} recordings could not be tracked.", file=sys.stderr)
+        names = [Path(report["recording"]).name for report in reports if "error" in report]
+        named = ", ".join(names[:MAX_NAMED]) + (", ..." if failures > MAX_NAMED else "")
+        print(
+            f"tonguetrack: {failures} of {len(jobs)} recordings could not be tracked: {named}",
+            file=sys.stderr,
+        )
         return 2
     return 0
 
