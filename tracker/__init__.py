@@ -6,6 +6,10 @@ from typing import Any
 if __name__ != "tonguetrack.tracker":
     raise ImportError("import tonguetrack.tracker (the checkout's folder is mapped below that name)")
 
+from .kernelcache import ensure_a_writable_cache
+
+ensure_a_writable_cache()
+
 # Loaded when first used: the command line lives below this package and must answer --help at once.
 _HOME_OF = {
     "PoseStatus": "pose",

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from ..kernelcache import cache_lasts
 from ..latency import NS_PER_MS, NS_PER_US, LogHistogram
 from ..live import LiveStatus, Source
 from ..pose import PoseStatus
@@ -44,9 +45,12 @@ def announced_compilation() -> Iterator[None]:
     finally:
         notice.cancel()
     if misses() > before:
-        _say(
-            f"the solver was compiled in {time.perf_counter() - start:.1f} s; the next start finds it ready."
+        lasts = (
+            "the next start finds it ready."
+            if cache_lasts()
+            else "it cannot be kept here; name a folder that can be written to with NUMBA_CACHE_DIR."
         )
+        _say(f"the solver was compiled in {time.perf_counter() - start:.1f} s; {lasts}")
 
 
 @contextmanager
