@@ -254,6 +254,31 @@ def test_the_monitor_shows_what_the_demo_sends(folder):
     assert "unknown address /stranger" in "".join(said)
 
 
+def test_one_message_with_other_arguments_does_not_hide_the_stream(capsys):
+    from tonguetrack.tracker.cli.monitor import _report
+    from tonguetrack.tracker.streams.monitor import Monitor
+
+    class Heard(Monitor):
+        def hear(self, path, *values):
+            self._message(path, list(values), ("127.0.0.1", 5), 0)
+
+        def frame(self, number):
+            self.hear("/tongue/frame", number, 0.1, 1)
+            self.hear("/tongue/sigma", 0.5)
+            self.hear("/tongue/quality", 0.8, 3, 0.1)
+
+    monitor = Heard()
+    monitor.frame(0)
+    monitor.hear("/tongue/frame", 7)
+    so_far = _report(monitor, 0, 0)
+    assert "frame 0 ok  sigma +0.50" in (told := capsys.readouterr().err)
+    assert "1 messages with other arguments" in told
+    monitor.frame(1)
+    _report(monitor, *so_far)
+    assert "frame 1 ok" in (told := capsys.readouterr().err)
+    assert "other arguments" not in told
+
+
 def test_a_taken_port_is_one_sentence_and_exit_code_2(receiver, capsys):
     assert main(["monitor", "--listen", address_of(receiver)]) == 2
     printed = capsys.readouterr()

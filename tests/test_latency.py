@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tonguetrack.tracker.latency import LogHistogram, latency_histogram
+from tonguetrack.tracker.latency import LogHistogram, latency_histogram, percentiles_text
 
 
 def filled(values, low=1e2, high=1e10):
@@ -67,3 +67,10 @@ def test_histograms_of_other_bins_do_not_merge():
 
 def test_as_dict_is_in_multiples_of_the_unit():
     assert filled([2_000_000]).as_dict(1e6) == {"p50": 2.0, "p99": 2.0, "max": 2.0, "count": 1}
+
+
+def test_percentiles_read_without_powers_of_ten():
+    assert percentiles_text({"p50": 78.31, "p99": 134.2, "max": 8750.4, "count": 9}, "us") == (
+        "p50 78.3 us  p99 134 us  max 8750 us"
+    )
+    assert percentiles_text(latency_histogram().as_dict(), "us") == "-"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Mapping
 from math import exp, log
 
 import numpy as np
@@ -83,6 +84,17 @@ class LogHistogram:
             **{name: None if value is None else value / unit for name, value in values.items()},
             "count": self.count,
         }
+
+
+def percentiles_text(values: Mapping[str, float | int | None], unit: str) -> str:
+    """What `as_dict` gave, for people: three digits, and no powers of ten for a slow first frame."""
+    if not values["count"]:
+        return "-"
+    shown = {name: values[name] or 0.0 for name in ("p50", "p99", "max")}
+    return "  ".join(
+        f"{name} {value:.0f} {unit}" if value >= 100 else f"{name} {value:.3g} {unit}"
+        for name, value in shown.items()
+    )
 
 
 NS_PER_US = 1e3

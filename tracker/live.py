@@ -14,7 +14,7 @@ import numpy as np
 from ..drivers.frames import CoilFrame, Recording
 from ..drivers.replay import ReplaySource
 from ..model.multilinear import TongueModel
-from .latency import NS_PER_MS, NS_PER_US, latency_histogram, residual_histogram
+from .latency import NS_PER_MS, NS_PER_US, latency_histogram, percentiles_text, residual_histogram
 from .pose import PoseStatus, TrackedPose
 from .setup import Setup
 from .streams.osc import OscSink
@@ -137,11 +137,11 @@ class Summary:
         lines = [
             f"frames           {self.frames} in {self.duration_s:.2f} s{rate}",
             f"status           {shares or 'no frame arrived'}",
-            f"solve            {_percentiles(self.solve_us, 'us')}",
-            f"arrival to sent  {_percentiles(self.arrival_to_sent_ms, 'ms')}",
+            f"solve            {percentiles_text(self.solve_us, 'us')}",
+            f"arrival to sent  {percentiles_text(self.arrival_to_sent_ms, 'ms')}",
         ]
         if self.lateness_ms is not None:
-            lines.append(f"replay late by   {_percentiles(self.lateness_ms, 'ms')}")
+            lines.append(f"replay late by   {percentiles_text(self.lateness_ms, 'ms')}")
         if mean is not None and median is not None:
             lines.append(f"residual         mean {mean:.3f} mm, median {median:.3f} mm")
         lines.append(f"coils valid      {coils}")
@@ -285,9 +285,3 @@ def _summary(source: Source, info: StreamInfo, status: LiveStatus) -> Summary:
         missing_frames=status.missing_frames,
         sinks=tuple(SinkSummary(sink.destination, sink.sent, sink.dropped) for sink in status.sinks),
     )
-
-
-def _percentiles(values: Percentiles, unit: str) -> str:
-    if not values["count"]:
-        return "-"
-    return "  ".join(f"{name} {values[name]:.3g} {unit}" for name in ("p50", "p99", "max"))

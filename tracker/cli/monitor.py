@@ -93,10 +93,10 @@ def _listen(receiver: socket.socket, monitor: Monitor, seconds: float | None) ->
 
     start = time.perf_counter()
     end = start + (float("inf") if seconds is None else seconds)
-    report, frames = start + REPORT_PERIOD_S, 0
+    report, so_far = start + REPORT_PERIOD_S, (0, 0)
     while (now := time.perf_counter()) < end:
         if now >= report:
-            frames = _report(monitor, frames)
+            so_far = _report(monitor, *so_far)
             report += REPORT_PERIOD_S * (1 + int((now - report) / REPORT_PERIOD_S))
         receiver.settimeout(max(1e-3, min(end, report) - now))
         try:
@@ -107,29 +107,33 @@ def _listen(receiver: socket.socket, monitor: Monitor, seconds: float | None) ->
         monitor.receive(datagram, (sender[0], sender[1]), time.perf_counter_ns())
 
 
-def _report(monitor: Monitor, frames_before: int) -> int:
-    """One line a second while frames arrive. Returns the frames so far."""
+def _report(monitor: Monitor, frames_before: int, misfits_before: int) -> tuple[int, int]:
+    """One line a second while frames arrive. Returns the frames and the misfits so far."""
     from ..pose import PoseStatus
 
     frames = sum(stream.frames for stream in monitor.streams.values())
-    newest, quality = monitor.seen.get("/tongue/frame"), monitor.seen.get("/tongue/quality")
-    sigma = monitor.seen.get("/tongue/sigma")
-    if frames == frames_before or not (newest and quality and sigma):
-        return frames
-    if newest.misfits or quality.misfits or sigma.misfits:
-        _say(f"{frames - frames_before} frames/s, with arguments that are not in the table")
-        return frames
+    misfits = sum(seen.misfits for seen in monitor.seen.values())
+    if frames == frames_before:
+        return frames, misfits
+    others = f", {misfits - misfits_before} messages with other arguments" if misfits > misfits_before else ""
+    newest, quality, sigma = (
+        seen.fitting if (seen := monitor.seen.get(path)) else []
+        for path in ("/tongue/frame", "/tongue/quality", "/tongue/sigma")
+    )
+    if not (newest and quality and sigma):
+        _say(f"{frames - frames_before} frames/s{others}")
+        return frames, misfits
     lost = sum(stream.lost for stream in monitor.streams.values())
-    number, _, state = newest.last
-    residual, coils, latency = quality.last
+    number, _, state = newest
+    residual, coils, latency = quality
     known = [int(status) for status in PoseStatus]
     name = PoseStatus(state).name.lower() if state in known else state
-    weights = " ".join(f"{weight:+.2f}" for weight in sigma.last[:8])
+    weights = " ".join(f"{weight:+.2f}" for weight in sigma[:8])
     _say(
         f"{frames - frames_before} frames/s  frame {number} {name}  sigma {weights}  "
-        f"residual {residual:.2f} mm  coils {coils}  latency {latency:.2f} ms  lost {lost}"
+        f"residual {residual:.2f} mm  coils {coils}  latency {latency:.2f} ms  lost {lost}{others}"
     )
-    return frames
+    return frames, misfits
 
 
 def _say(text: str) -> None:

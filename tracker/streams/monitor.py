@@ -10,7 +10,7 @@ from typing import Any
 
 from pythonosc.osc_packet import OscPacket, ParseError
 
-from ..latency import NS_PER_MS, LogHistogram, latency_histogram
+from ..latency import NS_PER_MS, LogHistogram, latency_histogram, percentiles_text
 from .addresses import FRAME, INFO, QUALITY, find_address
 
 MAX_BYTES = 8192
@@ -102,13 +102,14 @@ class Stream:
 
 @dataclass
 class Seen:
-    """One known address. misfits: messages whose arguments are not those of the table."""
+    """One known address. misfits: messages whose arguments are not those of the table; fitting: the newest others."""
 
     count: int = 0
     misfits: int = 0
     first_ns: int = 0
     newest_ns: int = 0
     last: list[object] = field(default_factory=list)
+    fitting: list[Any] = field(default_factory=list)
 
     @property
     def rate_hz(self) -> float | None:
@@ -161,7 +162,9 @@ class Monitor:
             seen.misfits += 1
             if seen.misfits == 1:
                 self._tell(f"{path} from {_shown(sender)} has other arguments than {row.type_tags}")
-        elif row is FRAME:
+            return
+        seen.fitting = values
+        if row is FRAME:
             self._frame(values, sender)
         elif row is INFO:
             self._info(values, sender)
@@ -251,8 +254,7 @@ class Monitor:
                 f"({stream.lost_percent:.2f} %), {stream.late} late, {stream.repeated} repeated{starts}"
             )
         if self.latency_ns.count:
-            values = self.latency_ns.as_dict(NS_PER_MS)
-            shown = "  ".join(f"{name} {values[name]:.3g} ms" for name in ("p50", "p99", "max"))
+            shown = percentiles_text(self.latency_ns.as_dict(NS_PER_MS), "ms")
             lines.append(f"latency    {shown} (arrival at the tracker until written)")
         if self.seen:
             width = max(len(path) for path in self.seen)
