@@ -7,7 +7,7 @@ from pathlib import Path
 for _library in ("OPENBLAS", "OMP", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
-import pytest  # noqa: E402 - numpy reads the variables above when it is first imported
+import pytest
 
 NOWHERE = "the reference data are not there: set TONGUETRACK_REFERENCE_DATA to their folder"
 
