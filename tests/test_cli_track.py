@@ -126,6 +126,10 @@ def test_a_folder_tracked_into_itself_keeps_its_recordings(place, capsys):
     (place / "corpus").mkdir()
     for name in ("a.csv", "b.csv"):
         (place / "corpus" / name).write_text((place / "take.csv").read_text())
+    assert (
+        run("track", "corpus", "--model", "model.npz", "--out", "new") == 0
+    )  # several recordings need a folder
+    assert sorted(path.name for path in (place / "new").iterdir()) == ["a.csv", "b.csv"]
     assert run("track", "corpus", "--model", "model.npz", "--out", "corpus") == 2
     assert "corpus/a.csv: this file is read here" in capsys.readouterr().err
     assert (place / "corpus" / "a.csv").read_text() == (place / "take.csv").read_text()
@@ -169,6 +173,20 @@ def test_a_terminal_without_phonetic_letters_shows_their_numbers(place, encoding
     assert b"\\u02" in done.stdout
     if "--json" in arguments:
         json.loads(done.stdout.decode(encoding))
+
+
+def test_every_failure_in_a_corpus_names_its_recording(place, capsys):
+    text = (place / "take.csv").read_text().splitlines()
+    header = next(line for line in text if line.startswith("time_s"))
+    start = text[: text.index(header) + 1]
+    (place / "dead.csv").write_text(
+        "\n".join([*start, *(f"{k / 200}" + "," * header.count(",") for k in range(9))])
+    )
+    assert run("track", "dead.csv", "take.csv", "--model", "model.npz", "--json") == 2
+    captured = capsys.readouterr()
+    assert "tonguetrack: dead.csv: " in captured.err
+    assert "could not be tracked: dead.csv" in captured.err
+    assert json.loads(captured.out)["recordings"][0]["error"].startswith("dead.csv: ")
 
 
 def test_recordings_of_one_name_are_not_written_over_each_other(place, capsys):

@@ -42,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as reason:
         place = f"{reason.filename}: " if reason.filename else ""
         print(f"tonguetrack: {place}{reason.strerror or reason}.", file=sys.stderr)
+    except MemoryError:
+        print("tonguetrack: there is not enough memory for this.", file=sys.stderr)
     except KeyboardInterrupt:
         print("tonguetrack: stopped.", file=sys.stderr)
         return 130

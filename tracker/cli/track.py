@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -104,8 +105,9 @@ def run_track(args: argparse.Namespace) -> int:
             if len(jobs) == 1:
                 raise
             failures += 1
-            print(f"tonguetrack: {reason}", file=sys.stderr)
-            reports.append({"recording": str(job.path), "error": str(reason)})
+            sentence = str(reason) if str(job.path) in str(reason) else f"{job.path}: {reason}"
+            print(f"tonguetrack: {sentence}", file=sys.stderr)
+            reports.append({"recording": str(job.path), "error": sentence})
         else:
             reports.append(report)
     if args.json:
@@ -206,7 +208,8 @@ def plan_jobs(
 def _output_pattern(out: str, recordings: int) -> str:
     from ..posefiles import check_pose_suffix
 
-    if Path(out).is_dir() or out.endswith("/"):
+    named_a_folder = out.endswith(("/", os.sep)) or (recordings > 1 and not Path(out).suffix)
+    if named_a_folder or Path(out).is_dir():
         return str(Path(out) / "{name}.csv")
     check_pose_suffix(out)
     if recordings > 1 and "{name}" not in out:
