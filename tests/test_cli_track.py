@@ -175,6 +175,33 @@ def test_a_terminal_without_phonetic_letters_shows_their_numbers(place, encoding
         json.loads(done.stdout.decode(encoding))
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_names_that_are_not_utf_8_are_shown_and_kept(place, reference_data, capsys):
+    odd = os.fsdecode(b"t\xff")
+    (place / "take.csv").rename(place / f"{odd}.csv")
+    (place / "model.npz").rename(place / f"{odd}.npz")
+    assert (
+        run(
+            "track",
+            f"{odd}.csv",
+            "--model",
+            f"{odd}.npz",
+            "--out",
+            f"{odd}p.csv",
+            "--save-session",
+            "s2.toml",
+        )
+        == 0
+    )
+    assert run("track", f"{odd}.csv", "--model", f"{odd}.npz", "--session", "s2.toml") == 0
+    assert "t\\xff.csv" in capsys.readouterr().err
+    assert run("mesh", f"{odd}p.csv", "--frame", "3", "-o", f"{odd}.ply") == 0
+    samples = reference_data / "ultrax-tongue-meshes" / "sampleDatabase.yaml"
+    assert run("model", "build", samples, "-o", f"{odd}m.npz") == 0
+    assert run("model", "info", f"{odd}m.npz") == 0
+    assert "t\\xffm [" in capsys.readouterr().out
+
+
 def test_every_failure_in_a_corpus_names_its_recording(place, capsys):
     text = (place / "take.csv").read_text().splitlines()
     header = next(line for line in text if line.startswith("time_s"))

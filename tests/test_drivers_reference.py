@@ -229,3 +229,8 @@ def test_models_meshes_and_device_logs_are_not_recordings(reference_data):
     with pytest.raises(InputError, match="PLY mesh"):
         open_recording(reference_data / "mri-shape-framework/palate_template.ply")
     assert not any(item.is_recording for item in find_recordings(reference_data / "device-logs"))
+
+
+def test_a_track_without_coils_is_refused_in_plain_words(reference_data):
+    with pytest.raises(InputError, match="SSFF without coil positions"):
+        open_recording(reference_data / "recordings" / "emu_webapp" / "ssff" / "0020.fms")

@@ -205,14 +205,20 @@ def open_recording(
     if os.path.isdir(path):  # unlike Path.is_dir, quiet about impossible names
         path = _only_recording(path)
     options = Options(rate_hz, unit, layout)
-    form = recognise(read_head(path), str(path))
-    asked = _checked(form, str(path), options)
+    name = _as_text(path)
+    form = recognise(read_head(path), name)
+    asked = _checked(form, name, options)
     if form.words == "SSFF":
-        tracks = read_ssff_group(path)
-        recording = ssff.parse_group(tracks, str(path), asked)
+        tracks = {_as_text(suffix): track for suffix, track in read_ssff_group(path).items()}
+        recording = ssff.parse_group(tracks, name, asked)
     else:
-        recording = form.parse(read_whole(path), str(path), asked)
-    return _finish(form, recording, str(path), options)
+        recording = form.parse(read_whole(path), name, asked)
+    return _finish(form, recording, name, options)
+
+
+def _as_text(name: str | os.PathLike[str]) -> str:
+    """A file's name as text that every file of ours can hold: bytes that are not UTF-8 become \\xff."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def read_whole(path: Path) -> bytes:

@@ -147,7 +147,7 @@ def parse_group(tracks: Mapping[str, Track], name: str, options: Options) -> Rec
     notes: list[str] = []
     if not holds_coils(main):
         raise InputError(
-            f"{name}: the columns {list(main.columns)[:6]} hold no coil; expected names that end in x, y and z."
+            f"{name}: SSFF without coil positions (formants, pitch?); a coil's column names end in x, y and z."
         )
     filtered = False
     for suffix, track in sorted(tracks.items()):

@@ -56,7 +56,7 @@ def run_build(args: argparse.Namespace) -> int:
     from ...model.build import load_training_shapes, model_from_shapes, read_sample_database
     from ...model.files import check_model_suffix, save_model
     from ...model.tensor import cumulative_compactness
-    from .names import prepare_folder
+    from .names import as_text, prepare_folder
 
     check_model_suffix(args.output)
     prepare_folder(Path(args.output))
@@ -68,8 +68,8 @@ def run_build(args: argparse.Namespace) -> int:
     )
     shapes = load_training_shapes(database)
     provenance = {
-        "name": args.name or Path(args.output).stem,
-        "source": Path(args.samples).name,
+        "name": args.name or as_text(Path(args.output).stem),
+        "source": as_text(Path(args.samples).name),
         "speaker modes": str(args.speaker_modes),
         "pose modes": str(args.pose_modes),
     }

@@ -27,6 +27,11 @@ def named_model(name: str) -> TongueModel:
     return load_model(name)
 
 
+def as_text(name: str) -> str:
+    """A name from the command line as text that every file of ours can hold: bytes that are not UTF-8 become \\xff."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
+
+
 def keep_apart(outputs: Iterable[Path], sources: Iterable[Path]) -> None:
     """Refuses an output that is one of the files that are read, by whatever name."""
     read = {(found.st_dev, found.st_ino) for found in map(_found, sources) if found}
