@@ -175,6 +175,18 @@ def test_a_terminal_without_phonetic_letters_shows_their_numbers(place, encoding
         json.loads(done.stdout.decode(encoding))
 
 
+def test_a_corpus_with_a_folder_a_speaker_keeps_its_folders(place):
+    text = (place / "take.csv").read_text()
+    for name in ("s1/0001.csv", "s1/0001.txt", "s2/0001.csv", "s2/deep/0002.csv"):
+        (place / "corpus" / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / "corpus" / name).write_text(text)
+    assert run("track", "corpus", "--model", "model.npz", "--out", "out/") == 0
+    written = sorted(str(path.relative_to(place / "out")) for path in (place / "out").rglob("*.csv"))
+    assert written == ["s1/0001.csv.csv", "s1/0001.txt.csv", "s2/0001.csv", "s2/deep/0002.csv"]
+    assert run("track", "corpus", "--model", "model.npz", "--out", "flat/{name}.csv") == 2
+    assert not (place / "flat").exists()
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
 def test_names_that_are_not_utf_8_are_shown_and_kept(place, reference_data, capsys):
     odd = os.fsdecode(b"t\xff")

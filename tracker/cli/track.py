@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -171,6 +172,7 @@ def plan_jobs(
     from ...drivers import find_recordings
 
     found: list[Path] = []
+    below: dict[Path, Path] = {}  # the folders between what was named and the recording
     left_out: list[tuple[Path, str]] = []
     for place in places:
         if not Path(place).is_dir():
@@ -183,21 +185,29 @@ def plan_jobs(
                 f"{place}: no recording in this folder; 'tonguetrack info {place}' says what there is."
             )
         found.extend(recordings)
+        below.update((path, path.parent.relative_to(place)) for path in recordings)
         left_out.extend((item.path, item.left_out) for item in items if not item.is_recording)
     if out is None:
         return [Job(path, {}) for path in found], left_out
-    pattern = _output_pattern(out, len(found))
+    pattern, is_folder = _output_pattern(out, len(found))
+    names = {path: below.get(path, Path()) / path.stem if is_folder else Path(path.stem) for path in found}
+    if is_folder:  # two of one name side by side, such as 0021.pos and 0021.txt
+        several = Counter(names.values())
+        names = {
+            path: name.with_name(path.name) if several[name] > 1 else name for path, name in names.items()
+        }
     jobs = []
     taken: dict[Path, Path] = {}
     for path in found:
         outputs = {}
         for experiment in experiments:
-            file = Path(pattern.replace("{name}", path.stem))
+            file = Path(pattern.replace("{name}", str(names[path])))
             if len(experiments) > 1:
                 file = file.with_name(f"{file.stem}.experiment{experiment}{file.suffix}")
             if file in taken:
                 raise InputError(
-                    f"{path} and {taken[file]} would both be written to {file}; track them one by one."
+                    f"{path} and {taken[file]} would both be written to {file}; track them one by one, or the "
+                    "folder above them into a folder."
                 )
             taken[file] = path
             outputs[experiment] = file
@@ -205,19 +215,20 @@ def plan_jobs(
     return jobs, left_out
 
 
-def _output_pattern(out: str, recordings: int) -> str:
+def _output_pattern(out: str, recordings: int) -> tuple[str, bool]:
+    """The outputs' name with {name} where the recording's comes, and whether `out` was a folder."""
     from ..posefiles import check_pose_suffix
 
     named_a_folder = out.endswith(("/", os.sep)) or (recordings > 1 and not Path(out).suffix)
     if named_a_folder or Path(out).is_dir():
-        return str(Path(out) / "{name}.csv")
+        return str(Path(out) / "{name}.csv"), True
     check_pose_suffix(out)
     if recordings > 1 and "{name}" not in out:
         raise InputError(
             f"--out {out}: {recordings} recordings were found; give a folder, or a name with {{name}} in it "
             "such as 'poses/{name}.csv'."
         )
-    return out
+    return out, False
 
 
 def read_session(args: argparse.Namespace) -> Session:
