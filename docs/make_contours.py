@@ -10,6 +10,7 @@ import numpy as np
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+
 from tonguetrack.model.synthetic import PHONES, tongue_template, training_anatomies
 from tonguetrack.model.synthetic.samples import training_shapes
 

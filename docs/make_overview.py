@@ -10,9 +10,9 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from tonguetrack.tracker.bundled import bundled_model, bundled_recording
 
 from tonguetrack import track_recording
+from tonguetrack.tracker.bundled import bundled_model, bundled_recording
 
 FRAME = 610
 COIL, SKIN = "#d9480f", "#e8a89a"

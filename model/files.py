@@ -28,6 +28,7 @@ MODEL_SUFFIXES = (".npz", ".yaml", ".yml", ".json")
 
 # A full model of the paper's size (11 x 13 x 9300 doubles) has 10.6 MB; text needs a few times that.
 MAX_MODEL_BYTES = 1024 * 1024 * 1024
+MAX_NESTING = 100
 
 
 def load_model(path: str | Path) -> TongueModel:
@@ -89,6 +90,14 @@ def load_yaml_text(data: bytes, name: str) -> Any:
     """Parses YAML with the safe loader (the fast one where libyaml is present)."""
     import yaml
 
+    # libyaml recurses without a limit of its own and would take the process down with it.
+    brackets = np.frombuffer(data, dtype=np.uint8)
+    opening = np.isin(brackets, np.frombuffer(b"[{", dtype=np.uint8)).astype(np.int64)
+    closing = np.isin(brackets, np.frombuffer(b"]}", dtype=np.uint8)).astype(np.int64)
+    if data and int(np.cumsum(opening - closing).max()) > MAX_NESTING:
+        raise InputError(
+            f"{name}: this is nested more than {MAX_NESTING} levels deep, which no tongue model is."
+        )
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         return yaml.load(data, Loader=loader)

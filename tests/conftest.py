@@ -35,6 +35,7 @@ def small_model():
     The vertices lie on a half circle in the mid-sagittal plane, tip to root, with a strip on either side.
     """
     import numpy as np
+
     from tonguetrack.model.build import TrainingShapes, model_from_shapes
     from tonguetrack.model.multilinear import SurfaceMarks
 

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+
 from tonguetrack.model import save_model
 from tonguetrack.tracker import bench as module
 from tonguetrack.tracker.bench import bench, made_up_recording, report, solve_comparison

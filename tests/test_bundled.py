@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from tonguetrack.drivers import open_recording
 from tonguetrack.model.files import load_model
 from tonguetrack.tracker.bundled import bundled_model, bundled_recording

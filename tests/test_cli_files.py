@@ -6,10 +6,10 @@ import os
 
 import numpy as np
 import pytest
-from tonguetrack.drivers import Recording, open_recording, write_recording
-from tonguetrack.tracker.cli.files import add_commands
 
 from tonguetrack import InputError
+from tonguetrack.drivers import Recording, open_recording, write_recording
+from tonguetrack.tracker.cli.files import add_commands
 
 
 @pytest.fixture

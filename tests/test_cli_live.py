@@ -11,6 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
+from tonguetrack import InputError
 from tonguetrack.drivers import write_recording
 from tonguetrack.model import save_model
 from tonguetrack.tracker import bundled
@@ -18,8 +20,6 @@ from tonguetrack.tracker.bench import made_up_recording
 from tonguetrack.tracker.cli import main
 from tonguetrack.tracker.session import session_toml
 from tonguetrack.tracker.setup import complete_setup
-
-from tonguetrack import InputError
 
 # The command line with another recording and another model in the place of the bundled ones.
 WITH_FILES = """

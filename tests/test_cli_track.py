@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+
 from tonguetrack.drivers import Recording, write_recording
 from tonguetrack.model.files import save_model
 from tonguetrack.model.mesh import read_mesh

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from tonguetrack import InputError
 from tonguetrack.model.build import (
     TrainingShapes,
     load_training_shapes,
@@ -13,8 +15,6 @@ from tonguetrack.model.build import (
 from tonguetrack.model.midsagittal import midsagittal_vertices
 from tonguetrack.tracker.correspondences import estimate_correspondences, ordered_nearest, typical_frame
 from tonguetrack.tracker.session import Energy
-
-from tonguetrack import InputError
 
 ROLES = ("tongue_tip", "tongue_blade", "tongue_dorsum")
 

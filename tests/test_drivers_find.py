@@ -5,9 +5,9 @@ import sys
 
 import numpy as np
 import pytest
-from tonguetrack.drivers import Recording, find_recordings, open_recording, write_recording
 
 from tonguetrack import InputError
+from tonguetrack.drivers import Recording, find_recordings, open_recording, write_recording
 
 
 @pytest.fixture

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import loadmat, savemat
+
+from tonguetrack import InputError
 from tonguetrack.drivers.files.authors import authors_bytes
 from tonguetrack.drivers.files.common import Options
 from tonguetrack.drivers.files.npz import npz_bytes
 from tonguetrack.drivers.files.recognise import parse
 from tonguetrack.drivers.files.tabular import table_bytes
 from tonguetrack.drivers.frames import FrameOfReference, Recording
-
-from tonguetrack import InputError
 
 FRAMES = 6
 

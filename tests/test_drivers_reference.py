@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.io import loadmat
-from tonguetrack.drivers import find_recordings, open_recording
 
 from tonguetrack import InputError
+from tonguetrack.drivers import find_recordings, open_recording
 
 
 @pytest.fixture

@@ -6,9 +6,9 @@ import time
 
 import numpy as np
 import pytest
-from tonguetrack.drivers import Recording, ReplaySource
 
 from tonguetrack import InputError
+from tonguetrack.drivers import Recording, ReplaySource
 
 
 def recording(frames=20, rate=200.0, start=1.0):

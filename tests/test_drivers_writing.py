@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+
+from tonguetrack import InputError
+from tonguetrack.atomic import write_atomically
 from tonguetrack.drivers import FrameOfReference, Recording, open_recording, write_recording
 from tonguetrack.drivers.files.authors import authors_bytes
 from tonguetrack.drivers.files.npz import npz_bytes
 from tonguetrack.drivers.files.recognise import parse
 from tonguetrack.drivers.files.tabular import table_bytes
-
-from tonguetrack import InputError
-from tonguetrack.atomic import write_atomically
 
 WRITERS = {"a.csv": table_bytes, "a.npz": npz_bytes}
 COORDINATES = st.floats(-999, 999) | st.just(float("nan"))
@@ -191,3 +191,13 @@ def test_a_link_is_followed_and_the_usual_permissions_are_kept(tmp_path):
     plain = tmp_path / "plain"
     plain.write_bytes(b"")
     assert target.stat().st_mode == plain.stat().st_mode
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="nothing is write-protected here")
+def test_a_write_protected_file_is_not_replaced(tmp_path):
+    path = tmp_path / "kept.csv"
+    path.write_text("old")
+    path.chmod(0o444)
+    with pytest.raises(InputError, match="write-protected"):
+        write_atomically(path, b"new")
+    assert path.read_text() == "old"

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from tonguetrack.tracker.latency import LogHistogram, latency_histogram, percentiles_text
 
 

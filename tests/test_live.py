@@ -12,6 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
+from tonguetrack import InputError
 from tonguetrack.drivers import CoilFrame, ReplaySource
 from tonguetrack.model import save_model
 from tonguetrack.tracker.bench import made_up_recording
@@ -19,8 +21,6 @@ from tonguetrack.tracker.live import LiveStatus, run_live, stream_info, stream_r
 from tonguetrack.tracker.pose import PoseStatus
 from tonguetrack.tracker.streams.monitor import decode
 from tonguetrack.tracker.tracking import Tracker, track_recording
-
-from tonguetrack import InputError
 
 RATE_HZ = 250.0
 

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import yaml
+
+from tonguetrack import InputError
 from tonguetrack.model.build import (
     fill_missing_by_averaging,
     load_training_shapes,
@@ -11,8 +13,6 @@ from tonguetrack.model.build import (
 )
 from tonguetrack.model.mesh import Mesh, mesh_bytes, read_mesh
 from tonguetrack.model.tensor import cumulative_compactness
-
-from tonguetrack import InputError
 
 PAPER_SPEAKERS = [.5424, .7734, .8361, .8863, .9177, .9416, .9609, .9751, .9853, .9931, 1]  # fmt: skip
 PAPER_POSES = [.4931, .7903, .8771, .9185, .9420, .9591, .9715, .9808, .9875, .9923, .9960, .9983, 1]  # fmt: skip

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tonguetrack.model.files import load_model, model_bytes, save_model
 
 from tonguetrack import InputError
+from tonguetrack.model.files import load_model, model_bytes, save_model
 
 
 def test_our_file_keeps_everything(small_model, tmp_path):
@@ -167,6 +167,8 @@ def test_a_zip_that_unpacks_without_end_is_refused_before_it_is_read(tmp_path, m
         ("list.json", b"[1, 2]", "not a published tongue model"),
         ("cut.json", b'{"CoreTensor": [1,', "not a readable tongue model"),
         ("bad.yaml", b"a: [1, 2", "not readable YAML at line"),
+        ("deep.yaml", b"[" * 200_000, "nested more than 100 levels deep"),
+        ("deep.json", b"[" * 200_000, "not a readable tongue model"),
         ("other.yaml", b"meta: 1", "not a published tongue model"),
     ],
 )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from tonguetrack.model.tensor import cumulative_compactness, hosvd, mode_product, unfold
 
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 12))

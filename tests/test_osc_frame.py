@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_packet import OscPacket
+
+from tonguetrack import InputError
 from tonguetrack.tracker.pose import PoseStatus, TrackedPose
 from tonguetrack.tracker.streams.addresses import ADDRESSES, MAX_DATAGRAM_BYTES, find_address, protocol_page
 from tonguetrack.tracker.streams.osc import FrameBundle, info_datagrams, parse_destination
 from tonguetrack.tracker.streams.sink import StreamInfo
-
-from tonguetrack import InputError
 
 IMMEDIATELY = 1
 

@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 from pythonosc.osc_message_builder import OscMessageBuilder
+
 from tonguetrack.tracker.pose import PoseStatus, TrackedPose
 from tonguetrack.tracker.streams import monitor as module
 from tonguetrack.tracker.streams.monitor import Monitor, Stream, decode

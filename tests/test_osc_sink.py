@@ -10,12 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pythonosc.osc_packet import OscPacket
+
+from tonguetrack import InputError
 from tonguetrack.tracker.pose import PoseStatus, TrackedPose
 from tonguetrack.tracker.streams import osc
 from tonguetrack.tracker.streams.osc import OscSink
 from tonguetrack.tracker.streams.sink import StreamInfo
-
-from tonguetrack import InputError
 
 SIZE = 4
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
+from tonguetrack import InputError
 from tonguetrack.drivers.frames import Recording
 from tonguetrack.tracker.posefiles import read_poses, write_poses
 from tonguetrack.tracker.session import Session
 from tonguetrack.tracker.tracking import track_recording
-
-from tonguetrack import InputError
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,12 @@ import itertools
 
 import numpy as np
 import pytest
+
+from tonguetrack import InputError
 from tonguetrack.drivers.frames import FrameOfReference, Recording
 from tonguetrack.tracker.coilmap import guess_coil_map
 from tonguetrack.tracker.session import Alignment, Energy, Session, axis_mapping, load_session, session_toml
 from tonguetrack.tracker.setup import complete_setup, suggested_axes
-
-from tonguetrack import InputError
 
 FULL = """
 model = "0123456789abcdef"
@@ -139,6 +139,7 @@ def test_an_empty_session_states_nothing(tmp_path):
         ("[energy]\nalpha = inf", "expected a finite number"),
         ("coils = 3", r"'coils' should be a table, \[coils\]"),
         ("[coils", "not readable TOML"),
+        ("a = " + "[" * 50_000, "nested too deeply"),
     ],
 )
 def test_a_wrong_session_is_named_with_its_table_and_key(tmp_path, text, sentence):
@@ -210,7 +211,7 @@ def test_a_channel_without_data_gets_no_role():
 def test_names_that_say_nothing_are_asked_for():
     take = recording_of(["Ch1", "Ch2"], np.zeros((1, 2, 3)))
     with pytest.raises(
-        InputError, match="cannot tell from the channel names Ch1, Ch2 .* name them with --coils"
+        InputError, match=r"names of the channels that have data \(Ch1, Ch2\) .* name them with --coils"
     ):
         guess_coil_map(take.coils, take.positions, "take")
 

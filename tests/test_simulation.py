@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
+
+from tonguetrack import InputError
 from tonguetrack.drivers import open_recording
 from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.session import Session
 from tonguetrack.tracker.simulation import Simulation, coil_vertex, simulate, write_simulation
 from tonguetrack.tracker.tracking import track_recording
-
-from tonguetrack import InputError
 
 PHONES = ("ə", "i", "ɑ", "s")
 

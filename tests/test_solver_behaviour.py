@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+
 from tonguetrack.tracker import kernels
 from tonguetrack.tracker.pose import PoseStatus
 from tonguetrack.tracker.preparation import Preparation

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+
 from tonguetrack.tracker import kernels
 from tonguetrack.tracker.pose import PoseStatus
 from tonguetrack.tracker.session import Energy

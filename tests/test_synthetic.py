@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from tonguetrack.model.mesh import vertex_normals
 from tonguetrack.model.synthetic import (
     PHONES,

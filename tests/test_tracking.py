@@ -6,6 +6,8 @@ import json
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+
+from tonguetrack import InputError
 from tonguetrack.drivers import open_recording
 from tonguetrack.drivers.frames import CoilFrame, Recording
 from tonguetrack.model.build import load_training_shapes, model_from_shapes, read_sample_database
@@ -14,8 +16,6 @@ from tonguetrack.tracker.pose import PoseStatus
 from tonguetrack.tracker.posefiles import write_poses
 from tonguetrack.tracker.session import Alignment, Session
 from tonguetrack.tracker.tracking import Tracker, track_recording
-
-from tonguetrack import InputError
 
 VERTICES = {"tongue_tip": 3, "tongue_blade": 9, "tongue_dorsum": 15}
 

@@ -23,6 +23,8 @@ def write_atomically(path: str | os.PathLike[str], content: bytes | Callable[[Bi
     target = Path(os.path.realpath(path))
     if os.path.isdir(target):  # unlike Path.is_dir, quiet about impossible names
         raise InputError(f"{path}: this is a folder; give the name of a file to write.")
+    if os.path.exists(target) and not os.access(target, os.W_OK):
+        raise InputError(f"{path}: this file is write-protected; choose another name.")
     temporary = target.with_name(f".{target.name[:80]}.{secrets.token_hex(4)}.part")
     try:
         handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)

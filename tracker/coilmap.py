@@ -113,8 +113,10 @@ def guess_coil_map(coils: Sequence[str], positions: FloatArray, source: str) -> 
     tips = [name for name in coils if simple[name] in _TIP_NAMES and name in live]
     others = [name for name in coils if simple[name] in _TONGUE_NAMES and name in live]
     if len(tips) != 1 or len(others) > 3:
+        with_data = [name for name in coils if name in live] or ["none"]
         raise InputError(
-            f"{source}: cannot tell from the channel names {', '.join(coils)} which coils sit on the tongue; "
+            f"{source}: cannot tell from the names of the channels that have data ({', '.join(with_data)}) which "
+            "coils sit on the tongue; "
             "name them with --coils CHANNEL=ROLE,... or in the session's [coils], with the roles "
             f"{', '.join(TONGUE_ROLES[4])}."
         )

@@ -124,6 +124,8 @@ def load_session(path: str | Path) -> Session:
         raise InputError(f"{path}: {path.stat().st_size} bytes are too many for a session file.")
     try:
         content = tomllib.loads(path.read_bytes().decode())
+    except RecursionError as reason:
+        raise InputError(f"{path}: this is nested too deeply to be a session file.") from reason
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as reason:
         raise InputError(f"{path}: this is not readable TOML ({reason}).") from reason
     try:

@@ -10,6 +10,7 @@ one frame, as in the paper, and from all frames together, as `tonguetrack track`
 import sys
 
 import numpy as np
+
 from tonguetrack.model.build import (
     TrainingShapes,
     load_training_shapes,
