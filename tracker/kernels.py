@@ -381,11 +381,45 @@ def free_gradient_and_hessian(
 
 
 @njit(**OPTIONS)
+def _quartic_along_step(
+    coils, core, share, beta, gamma, weights, target, jacobian, residual, first_order, second_order
+):
+    """The coefficients of t^2, t^3, t^4 of E(weights + t (target - weights)) - E(weights); that of t is the slope.
+
+    The residual along the step is residual + t first_order + t^2 second_order, exactly: v is bilinear.
+    """
+    speakers, poses, rows = core.shape
+    for row in range(rows):
+        first_order[row] = 0.0
+        second_order[row] = 0.0
+    second = 0.0
+    for a in range(weights.shape[0]):
+        delta = target[a] - weights[a]
+        second += (beta[a] + gamma[a]) * delta * delta
+        for row in range(rows):
+            first_order[row] += delta * jacobian[a, row]
+    for l in range(speakers):
+        for k in range(poses):
+            delta = (target[l] - weights[l]) * (target[speakers + k] - weights[speakers + k])
+            for row in range(rows):
+                second_order[row] += delta * core[l, k, row]
+    third = 0.0
+    fourth = 0.0
+    for i in range(coils.shape[0]):
+        if np.isnan(coils[i, 0]):
+            continue
+        for row in range(3 * i, 3 * i + 3):
+            first, bend = first_order[row], second_order[row]
+            second += share * (first * first + 2.0 * residual[row] * bend)
+            third += share * 2.0 * first * bend
+            fourth += share * bend * bend
+    return second, third, fourth
+
+
+@njit(**OPTIONS)
 def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scratch, coil_scratch):
     """Minimises E over the box from `weights`, in place. Returns E at the minimiser."""
     size = weights.shape[0]
-    rows = core.shape[2]
-    speakers = core.shape[0]
     hessian = scratch[:size]
     shifted = scratch[size : 2 * size]
     gradient = scratch[2 * size]
@@ -458,44 +492,9 @@ def _descend(coils, base, core, box, alpha, beta, gamma, previous, weights, scra
                 shift *= 8.0
             if shift > 1e30:
                 return energy
-        # E(t) along the step: the residual is residual + t first + t^2 second, exactly.
-        for row in range(rows):
-            first_order[row] = 0.0
-            second_order[row] = 0.0
-        for a in range(size):
-            delta = target[a] - weights[a]
-            for row in range(rows):
-                first_order[row] += delta * jacobian[a, row]
-        for l in range(speakers):
-            for k in range(size - speakers):
-                delta = (target[l] - weights[l]) * (target[speakers + k] - weights[speakers + k])
-                for row in range(rows):
-                    second_order[row] += delta * core[l, k, row]
-        for i in range(coils.shape[0]):
-            if np.isnan(coils[i, 0]):
-                for row in range(3 * i, 3 * i + 3):
-                    second_order[row] = 0.0
-        rr = 0.0
-        ra = 0.0
-        aa_rb = 0.0
-        ab = 0.0
-        bb = 0.0
-        for row in range(rows):
-            r = residual[row]
-            a1 = first_order[row]
-            b1 = second_order[row]
-            rr += r * r
-            ra += 2.0 * r * a1
-            aa_rb += a1 * a1 + 2.0 * r * b1
-            ab += 2.0 * a1 * b1
-            bb += b1 * b1
-        prior_second = 0.0
-        for a in range(size):
-            delta = target[a] - weights[a]
-            prior_second += (beta[a] + gamma[a]) * delta * delta
-        third = share * ab
-        fourth = share * bb
-        second = share * aa_rb + prior_second
+        second, third, fourth = _quartic_along_step(
+            coils, core, share, beta, gamma, weights, target, jacobian, residual, first_order, second_order
+        )
         length = 1.0
         change = slope + second + third + fourth
         while change > 1e-4 * length * slope and length > 1e-12:
