@@ -1,6 +1,6 @@
 """The session: everything known about one speaker's set-up, in a TOML file that a person can edit.
 
-    model = "fa9b8dece7ea1236"        # fingerprint of the model that vertices and speaker belong to
+    model = "0123456789abcdef"        # fingerprint of the model that vertices and speaker belong to
 
     [coils]                           # file channel = role
     t_tip = "tongue_tip"
