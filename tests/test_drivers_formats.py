@@ -262,10 +262,11 @@ def test_normpos_lines_mean_that_the_head_is_corrected():
     assert corrected.extra["normpos.FIR_5_15"] == "1,2"
 
 
-def test_a_pos_file_that_a_crash_cut_opens_and_says_what_was_dropped():
-    recording = parse(ag50x(tail=b"\1" * 13), "a.pos")
-    assert recording.frame_count == FRAMES
-    assert any("last 13 bytes" in note for note in recording.notes)
+def test_a_pos_file_cut_within_a_frame_is_refused_and_opens_at_the_size_that_is_named():
+    cut = ag50x(tail=b"\1" * 13)
+    with pytest.raises(InputError, match=rf"{FRAMES} whole frames .* cut it to {len(cut) - 13} bytes"):
+        parse(cut, "a.pos")
+    assert parse(cut[:-13], "a.pos").frame_count == FRAMES
 
 
 @pytest.mark.parametrize(
@@ -310,9 +311,9 @@ def test_an_ag500_layout_and_rate_can_be_said():
     assert recording.rate_hz == 250.0
 
 
-def test_headerless_ag500_data_may_end_within_a_frame():
-    recording = parse(ag500("angles") + b"\0\0\0", "a.pos")
-    assert any("last 3 bytes" in note for note in recording.notes)
+def test_headerless_ag500_data_cut_within_a_frame_is_refused():
+    with pytest.raises(InputError, match="3 of 336 bytes.; it is truncated"):
+        parse(ag500("angles") + b"\0\0\0", "a.pos")
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
@@ -340,10 +341,9 @@ def test_carstens_text_names_the_line_that_is_wrong():
         parse(b"\n".join([*lines[:2], b"1\t2\t3", *lines[2:3]]), "a.txt", Options(rate_hz=250.0))
 
 
-def test_an_unfinished_last_line_is_dropped_with_a_note():
-    recording = parse(carstens_text()[:-30], "a.txt", Options(rate_hz=250.0))
-    assert recording.frame_count == FRAMES - 1
-    assert any("last line is incomplete" in note for note in recording.notes)
+def test_an_unfinished_last_line_is_refused_with_what_to_do():
+    with pytest.raises(InputError, match="truncated, so copy it again, or remove that line to read the rest"):
+        parse(carstens_text()[:-30], "a.txt", Options(rate_hz=250.0))
 
 
 # Wave -----------------------------------------------------------------------------------------------

@@ -166,9 +166,7 @@ AUTHORS_CASES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("file", "coils"), AUTHORS_CASES)
-def test_every_frame_is_at_or_below_a_tight_minimiser_of_the_published_energy(reference_data, file, coils):
-    """The minimiser starts from the same previous frame; relative 1e-6, both experiments."""
+def tracked_authors_data(reference_data, file, coils):
     folder = reference_data / "authors-format"
     model = load_model(folder / "synthetic_model.yaml")
     recording = open_recording(folder / file)
@@ -176,7 +174,13 @@ def test_every_frame_is_at_or_below_a_tight_minimiser_of_the_published_energy(re
         coils={channel: role for channel, (role, _) in coils.items()},
         correspondences={role: vertex for role, vertex in coils.values()},
     )
-    run = track_recording(recording, model, session)
+    return model, recording, track_recording(recording, model, session)
+
+
+@pytest.mark.parametrize(("file", "coils"), AUTHORS_CASES)
+def test_every_frame_is_at_or_below_a_tight_minimiser_of_the_published_energy(reference_data, file, coils):
+    """The minimiser starts from the same previous frame; relative 1e-6, both experiments."""
+    model, _, run = tracked_authors_data(reference_data, file, coils)
     core = model.at(run.setup.vertices).core
     origin = model.at(run.setup.vertices).origin
     mean = np.r_[model.speaker.mean, model.pose.mean]
@@ -226,14 +230,7 @@ def test_every_frame_is_at_or_below_a_tight_minimiser_of_the_published_energy(re
 def test_a_whole_run_on_the_authors_data_is_written_in_the_authors_json(
     reference_data, tmp_path, file, coils
 ):
-    folder = reference_data / "authors-format"
-    model = load_model(folder / "synthetic_model.yaml")
-    recording = open_recording(folder / file)
-    session = Session(
-        coils={channel: role for channel, (role, _) in coils.items()},
-        correspondences={role: vertex for role, vertex in coils.values()},
-    )
-    run = track_recording(recording, model, session)
+    model, recording, run = tracked_authors_data(reference_data, file, coils)
     for poses in (run.experiment_1, run.experiment_2):
         write_poses(poses, model, tmp_path / "poses.json")
         frames = json.loads((tmp_path / "poses.json").read_text())

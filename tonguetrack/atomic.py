@@ -51,7 +51,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes | Callable[[Bi
 def _cannot_write(path: str | os.PathLike[str], error: OSError) -> InputError:
     folder = Path(path).parent
     match error.errno:
-        case errno.ENOENT:
+        case errno.ENOENT if not folder.is_dir():
             return InputError(f"{path}: the folder {folder} does not exist; create it or choose another.")
         case errno.ENOTDIR:
             return InputError(f"{path}: {folder} is not a folder; choose another place.")

@@ -51,7 +51,7 @@ def is_ag50x(head: bytes) -> bool:
 def parse_ag50x(data: bytes, name: str, options: Options) -> Recording:
     """An AG501 (AG50x) .pos file, versions V001 to V003.
 
-    Frame i is placed at i / rate seconds. Bytes after the last whole frame are left out with a note.
+    Frame i is placed at i / rate seconds. A file that ends within a frame is refused.
     """
     version = data[9:14].decode("latin-1").strip()
     if version not in ("_V001", "_V002", "_V003"):
@@ -80,7 +80,8 @@ def parse_ag50x(data: bytes, name: str, options: Options) -> Recording:
     check_rate(rate, name)
     if channels == 0:
         raise InputError(f"{name}: the header declares no channels.")
-    samples, notes = _float_frames(data, header_bytes, channels, name)
+    samples = _float_frames(data, header_bytes, channels, name)
+    notes: list[str] = []
     corrected = [key for key in fields if key.startswith("normpos.")]
     if corrected:
         frame = NORMPOS_FRAME
@@ -142,7 +143,8 @@ def parse_ag500(data: bytes, name: str, options: Options) -> Recording:
             f"{name}: headerless .pos data of unclear layout; pass --layout vector (unit vectors in columns "
             "4 to 6) or --layout angles (phi and theta in degrees)."
         )
-    samples, notes = _float_frames(data, 0, AG500_CHANNELS, name)
+    samples = _float_frames(data, 0, AG500_CHANNELS, name)
+    notes: list[str] = []
     rate = check_rate(options.rate_hz or AG500_RATE_HZ, name)
     if options.rate_hz is None:
         notes.insert(0, "The file has no header: 12 channels at 200 Hz are assumed, as the AG500 records.")
@@ -200,7 +202,7 @@ def is_text_without_header(lines: Sequence[str]) -> bool:
     """Whether the first lines hold 7 columns a channel with believable angles, fit error and spare."""
     if not lines or _delimiter(lines[0]) is None:
         return False
-    rows, _ = split_rows("\n".join(lines[:50]) + "\n", _delimiter(lines[0]))
+    rows = split_rows("\n".join(lines[:50]) + "\n", _delimiter(lines[0]), "")
     width = _width(rows[0]) if rows else 0
     if width == 0 or width % 7:
         return False
@@ -232,7 +234,8 @@ def parse_text(data: bytes, name: str, options: Options) -> Recording:
     The export states no sampling rate: InputError asks for --rate when options do not give it.
     """
     text = decode(data)
-    rows, notes = split_rows(text, _delimiter(text.split("\n", 1)[0]))
+    rows = split_rows(text, _delimiter(text.split("\n", 1)[0]), name)
+    notes: list[str] = []
     coils = _channel_names(rows[0]) if rows else None
     first_line = 1
     if coils is not None:
@@ -264,8 +267,8 @@ def parse_text(data: bytes, name: str, options: Options) -> Recording:
 # Shared ---------------------------------------------------------------------------------------------
 
 
-def _float_frames(data: bytes, start: int, channels: int, name: str) -> tuple[FloatArray, list[str]]:
-    """(frames, channels, 7) float64 from `start` on, and a note when bytes are left over."""
+def _float_frames(data: bytes, start: int, channels: int, name: str) -> FloatArray:
+    """(frames, channels, 7) float64 from `start` on; a file that ends within a frame is refused."""
     frame_bytes = channels * 28
     count, rest = divmod(len(data) - start, frame_bytes)
     if count == 0:
@@ -273,14 +276,14 @@ def _float_frames(data: bytes, start: int, channels: int, name: str) -> tuple[Fl
             f"{name}: {len(data) - start} bytes after the header are less than one frame of {channels} channels "
             f"({frame_bytes} bytes); the file is truncated, so copy or record it again."
         )
+    if rest:
+        raise InputError(
+            f"{name}: after {count} whole frames the file ends within a frame ({rest} of {frame_bytes} bytes); it is "
+            f"truncated, so copy it again, or cut it to {len(data) - rest} bytes to read the whole frames."
+        )
     numbers = np.frombuffer(data, "<f4", count * channels * 7, start)
     with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaN
-        samples = numbers.reshape(count, channels, 7).astype(np.float64)
-    if rest:
-        return samples, [
-            f"The last {rest} bytes are not a whole frame (an interrupted recording?) and were left out."
-        ]
-    return samples, []
+        return numbers.reshape(count, channels, 7).astype(np.float64)
 
 
 def _recording(

@@ -67,19 +67,21 @@ def decode(data: bytes) -> str:
         return data.decode("latin-1")
 
 
-def split_rows(text: str, delimiter: str | None) -> tuple[list[list[str]], list[str]]:
-    """Cells of every non-blank line (delimiter None = runs of blanks), and notes.
+def split_rows(text: str, delimiter: str | None, name: str) -> list[list[str]]:
+    """Cells of every non-blank line (delimiter None = runs of blanks).
 
-    A last line without a line end and with fewer cells than the line before it is what a recorder
-    that died leaves behind: it is dropped, and a note says so.
+    A last line without a line end and with fewer cells than the line before it is what a recorder or a
+    copy that died leaves behind: InputError says how to keep the rest, rather than losing it unasked.
     """
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     unfinished = bool(lines[-1].strip())
     rows = [line.split(delimiter) for line in lines if line.strip()]
     if unfinished and len(rows) > 2 and len(rows[-1]) < len(rows[-2]):
-        rows.pop()
-        return rows, ["The last line is incomplete (an interrupted recording?) and was left out."]
-    return rows, []
+        raise InputError(
+            f"{name}: the last line (line {len(lines)}) stops after {len(rows[-1])} of {len(rows[-2])} columns; the "
+            "file is truncated, so copy it again, or remove that line to read the rest."
+        )
+    return rows
 
 
 def number_table(rows: Sequence[Sequence[str]], columns: int, name: str, first_line: int = 1) -> FloatArray:

@@ -54,7 +54,8 @@ def is_headerless_mocha(lines: Sequence[str]) -> bool:
 
 def parse_headerless_mocha(data: bytes, name: str, options: Options) -> Recording:
     """MOCHA's ASCII variant without a header; channel names and 500 Hz by MOCHA's convention."""
-    rows, notes = split_rows(decode(data), None)
+    rows = split_rows(decode(data), None, name)
+    notes: list[str] = []
     table = number_table(rows, 22, name)
     notes.append("The file has no header: channel names and order are those of MOCHA-TIMIT.")
     words = "EST_Track, ASCII without header (MOCHA convention)"

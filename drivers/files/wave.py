@@ -55,7 +55,8 @@ def _is_float(cell: str) -> bool:
 
 def parse_v1(data: bytes, name: str, options: Options) -> Recording:
     """A Wave v1 table. Samples that are blank, or whose status is 119 or 183, are NaN."""
-    rows, notes = split_rows(decode(data), "\t")
+    rows = split_rows(decode(data), "\t", name)
+    notes: list[str] = []
     header, body = [cell.strip() for cell in rows[0]], rows[1:]
     while header and not header[-1]:
         header.pop()
@@ -100,7 +101,8 @@ def parse_v2(data: bytes, name: str, options: Options) -> Recording:
 
     Columns whose cell in the first line is a single space separate sensors and are skipped.
     """
-    rows, notes = split_rows(decode(data), "\t")
+    rows = split_rows(decode(data), "\t", name)
+    notes: list[str] = []
     first = rows[0]
     has_header = not _is_float(first[0])
     kept = [k for k, cell in enumerate(first) if cell != " "]

@@ -35,7 +35,8 @@ def is_txy(lines: Sequence[str]) -> bool:
 
 def parse_txy(data: bytes, name: str, options: Options) -> Recording:
     """An X-ray microbeam record; T1 is the tongue tip."""
-    rows, notes = split_rows(decode(data), None)
+    rows = split_rows(decode(data), None, name)
+    notes: list[str] = []
     table = number_table(rows, COLUMNS, name)
     values = table[:, 1:].reshape(len(table), len(PELLETS), 2)
     lost = (values == LOST).any(axis=2)
