@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -24,6 +24,8 @@ class ReplaySource:
     speed: 1.0 is real time, 2.0 twice as fast; None delivers without waiting.
     loop: begin again after the last frame, until closed. Times and frame numbers go on increasing: one
     pass is as long as the recording plus one sampling interval.
+    A take's own device times and frame numbers are delivered as they were recorded, jumps and all, unless
+    it loops; the pace is that of the frames' arrival.
 
     The first frame is due at once and sets the clock: frame i is due (times_s[i] - times_s[0]) / speed
     after it, so that a slow reader or a late wake-up never shifts the rest. A reader that falls behind
@@ -47,6 +49,8 @@ class ReplaySource:
         self._positions = recording.positions.view()
         self._positions.flags.writeable = False
         self._times: list[float] = recording.times_s.tolist()
+        self._device_times = _list(recording.device_times_s) if not loop else None
+        self._numbers = _list(recording.frame_numbers) if not loop else None
         self._pass_s = self._times[-1] - self._times[0] + 1.0 / recording.rate_hz
         self._next = 0
         self._passes = 0
@@ -73,8 +77,12 @@ class ReplaySource:
     ) -> None:
         self.close()
 
+    def stop(self) -> None:
+        """End the replay; a reader that waits for a frame stops within 0.1 s. May be called from a signal handler."""
+        self._closed = True
+
     def close(self) -> None:
-        """End the replay; a reader that waits for a frame stops within 0.1 s."""
+        """As `stop`: there is nothing to take leave of."""
         self._closed = True
 
     def __iter__(self) -> Self:
@@ -99,10 +107,32 @@ class ReplaySource:
             raise StopIteration
         self._next = index + 1
         number = self._passes * len(self._times) + index
+        device_time_s = since_start_s + self._times[index]
+        if self._device_times is not None:
+            device_time_s = self._device_times[index]
+        if self._numbers is not None:
+            number = self._numbers[index]
+        recording = self.recording
         arrival_ns = time.perf_counter_ns()
         self.lateness_ns[index] = arrival_ns - due_ns if self.speed is not None else 0
-        return CoilFrame(self._positions[index], since_start_s + self._times[index], number, arrival_ns)
+        return CoilFrame(
+            self._positions[index],
+            device_time_s,
+            number,
+            arrival_ns,
+            None if recording.quaternions is None else recording.quaternions[index],
+            None if recording.rms is None else recording.rms[index],
+            None if recording.status is None else recording.status[index],
+        )
+
+    @property
+    def address(self) -> str:
+        return f"replay:{self.recording.source}"
 
     def _wait_until(self, due_ns: int) -> None:
         while not self._closed and (left_ns := due_ns - time.perf_counter_ns()) > 0:
             time.sleep(min(left_ns * 1e-9, _NAP_S))
+
+
+def _list(values: np.ndarray | None) -> list[Any] | None:
+    return None if values is None else values.tolist()

@@ -6,7 +6,7 @@ the first two, a `TrackedPose` the coefficients of one instant, `TrackedPoses` t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
@@ -21,7 +21,18 @@ class PoseStatus(IntEnum):
     LOST = 0  # nothing was ever tracked, or the source is gone: the pose is the mean
     OK = 1
     HELD = 2  # no coil arrived in this frame: the pose is the previous one
-    RELAXING = 3  # no coil for longer: the pose drifts back to the mean (reserved for live sources)
+    RELAXING = 3  # no coil for longer, in a live run: the pose drifts back to the mean
+
+
+class CoilState(IntEnum):
+    """Whether a coil counts in this frame, and if not, why; the same numbers in takes."""
+
+    TRUSTED = 0
+    MISSING = 1  # the source has no position for it
+    WILD = 2  # it moved faster than any tongue
+    MISFIT = 3  # it lies much farther from the model than it used to
+    STUCK = 4  # it repeats one position to the last bit while others move
+    RETURNING = 5  # it behaves again, but not yet for long enough
 
 
 @dataclass(slots=True)
@@ -31,7 +42,9 @@ class TrackedPose:
     weights, normalised: (K,) raw, and in sigma from the mean.
     speaker_weights: (m,) raw; constant while the speaker is fixed.
     residuals_mm: (n,) distance of each coil from its vertex, NaN = missing.
-    residual_mm: their mean, NaN without any coil; energy: E at the minimiser, NaN likewise.
+    coil_states: (n,) `CoilState` of each coil; only trusted ones had a part in the pose.
+    speaker_fixed: whether the pose alone was solved.
+    residual_mm: mean distance of the trusted coils, NaN without any; energy: E at the minimiser, NaN likewise.
     device_time_s, frame_number: of the source; arrival_ns, solved_ns: `time.perf_counter_ns()` on this host.
     """
 
@@ -47,6 +60,8 @@ class TrackedPose:
     frame_number: int = 0
     arrival_ns: int = 0
     solved_ns: int = 0
+    speaker_fixed: bool = True
+    coil_states: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Live devices: the bytes are understood by pure functions, and moved by `link`."""

@@ -1,0 +1,1 @@
+"""Devices that are not there: they play recordings, as strictly and, if asked, as badly as real ones."""
