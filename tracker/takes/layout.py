@@ -88,13 +88,21 @@ class TakeInfo:
         return tuple(labels)
 
     def row_dtype(self) -> np.dtype:
-        """One frame as the loop hands it over. `sequence` counts from 1 and is written last: 0 = no whole row."""
-        return np.dtype(
-            [
-                ("arrival_ns", "<i8"),
-                (RAW, "<f8", (len(self.raw_labels),)),
-                (PREPARED, "<f8", (len(self.prepared_labels),)),
-                (POSE, "<f8", (len(self.pose_labels),)),
-                ("sequence", "<i8"),
-            ]
-        )
+        return row_dtype(len(self.raw_labels), len(self.prepared_labels), len(self.pose_labels))
+
+
+def row_dtype(raw: int, prepared: int, pose: int) -> np.dtype:
+    """One frame as the loop hands it over, for so many channels a stream.
+
+    Every column is made of words of 8 bytes. `sequence` counts the take's frames from 1: frame i is sample i of
+    the three number streams.
+    """
+    return np.dtype(
+        [
+            ("arrival_ns", "<i8"),
+            (RAW, "<f8", (raw,)),
+            (PREPARED, "<f8", (prepared,)),
+            (POSE, "<f8", (pose,)),
+            ("sequence", "<i8"),
+        ]
+    )
