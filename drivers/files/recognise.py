@@ -7,10 +7,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from ... import InputError
 from ..frames import Recording
-from . import authors, carstens, est, matlab, mview, npz, ssff, tabular, wave, xrmb
+from ..xdf import Buffer, map_file
+from . import authors, carstens, est, matlab, mview, npz, ssff, tabular, wave, xdf, xrmb
 from .common import UNITS_MM, Options, check_rate, even_times
 
 HEAD_BYTES = 1 << 16
@@ -42,15 +44,17 @@ class Head:
 class Format:
     """One readable format: how it is recognised and read, and what the user may say about it.
 
-    unit: the unit the format fixes, or None if a file must state it. layouts: words for --layout.
+    unit: the unit the format fixes, or None if a file must state it. layouts: words for --layout, None = names
+    that are in the file. mapped: large files are mapped, not read at once.
     """
 
     words: str
     suffixes: tuple[str, ...]
     fits: Callable[[Head], bool]
-    parse: Callable[[bytes, str, Options], Recording]
+    parse: Callable[[Any, str, Options], Recording]
     unit: str | None = "mm"
-    layouts: tuple[str, ...] = ()
+    layouts: tuple[str, ...] | None = ()
+    mapped: bool = False
 
 
 def _parse_one_ssff(data: bytes, name: str, options: Options) -> Recording:
@@ -64,6 +68,7 @@ FORMATS: tuple[Format, ...] = (
     Format("EST_Track", (".ema", ".track"), lambda h: est.is_est(h.data), est.parse_est, unit=None),
     Format("SSFF", (), lambda h: ssff.is_ssff(h.data), _parse_one_ssff, layouts=("raw", "filt")),
     Format("Haskins MVIEW .mat", (".mat",), lambda h: matlab.is_mat5(h.data), mview.parse_mview),
+    Format("XDF", (".xdf",), lambda h: xdf.is_xdf(h.data), xdf.parse_xdf, unit=None, layouts=None, mapped=True),
     Format("tonguetrack .npz", (".npz",), lambda h: npz.is_npz(h.data), npz.parse_npz),
     Format("tonguetrack CSV", (".csv",), lambda h: tabular.is_ours(h.text), tabular.parse_table),
     Format("authors' EMA JSON", (".json",), lambda h: authors.is_authors(h.text), authors.parse_authors),
@@ -110,7 +115,6 @@ _OTHERS: tuple[tuple[bytes, str], ...] = (
     (b"NIST_1A", "a NIST sound, not a record of coils"),
     (b"ply\n", "a PLY mesh, not a record of coils"),
     (b"ply\r\n", "a PLY mesh, not a record of coils"),
-    (b"XDF:", "an XDF take, which is not a coil file of its own"),
     (b"\x89HDF", "HDF5 (MATLAB -v7.3?); in MATLAB save it again with -v7"),
     (b"\x89PNG", "a picture, not a record of coils"),
     (b"\xff\xd8\xff", "a picture, not a record of coils"),
@@ -153,7 +157,7 @@ def _what_else(head: Head, name: str) -> str:
             return f"this is {what}"
     if not head.text:
         return (
-            "a binary file of no known format (known: AG50x and AG500 .pos, EST_Track, SSFF, MVIEW .mat, .npz); "
+            "a binary file of no known format (known: AG50x and AG500 .pos, EST_Track, SSFF, MVIEW .mat, XDF, .npz); "
             f"its content decides, whatever its name ends in ({Path(name).suffix or 'nothing'})"
         )
     if "CoreTensor" in head.text or '"ShapeSpace"' in head.text or "TruncatedSpeakerMode" in head.text:
@@ -197,7 +201,8 @@ def open_recording(
     folder are one recording; any of them opens it.
     rate_hz: the sampling rate where the file does not state it, or instead of the one it states.
     unit: of positions (m, dm, cm, mm, 10um = 0.01 mm, um), where the format leaves it open.
-    layout: "vector" or "angles" for a headerless AG500 .pos, "raw" or "filt" columns for SSFF.
+    layout: "vector" or "angles" for a headerless AG500 .pos, "raw" or "filt" columns for SSFF, the name of a
+    stream for XDF.
     Returns positions in mm in the file's own axes, NaN where a sample is missing; `notes` say what was
     assumed. Raises InputError, one sentence, naming the flag to pass where the file is ambiguous.
     """
@@ -212,7 +217,7 @@ def open_recording(
         tracks = {_as_text(suffix): track for suffix, track in read_ssff_group(path).items()}
         recording = ssff.parse_group(tracks, name, asked)
     else:
-        recording = form.parse(read_whole(path), name, asked)
+        recording = form.parse(_map_whole(path) if form.mapped else read_whole(path), name, asked)
     return _finish(form, recording, name, options)
 
 
@@ -224,6 +229,13 @@ def _as_text(name: str | os.PathLike[str]) -> str:
 def read_whole(path: Path) -> bytes:
     try:
         return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}).") from error
+
+
+def _map_whole(path: Path) -> Buffer:
+    try:
+        return map_file(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}).") from error
 
@@ -272,7 +284,7 @@ def _checked(form: Format, name: str, options: Options) -> Options:
             f"{name}: {form.words} states its positions in {form.unit}, so --unit {options.unit} cannot hold; "
             "leave it out."
         )
-    if options.layout is not None and options.layout not in form.layouts:
+    if options.layout is not None and form.layouts is not None and options.layout not in form.layouts:
         choice = f"choose from {', '.join(form.layouts)}" if form.layouts else "leave it out"
         raise InputError(f"{name}: {form.words} has no layout {options.layout!r}; {choice}.")
     return options
