@@ -12,6 +12,7 @@ from ... import InputError
 
 CONNECT_TIMEOUT_S = 3.0
 SEND_TIMEOUT_S = 2.0
+SERIAL_WAIT_S = 0.01
 RECEIVE_BYTES = 1 << 16
 
 
@@ -98,7 +99,6 @@ class SerialLink:
     def __init__(self, port: Any, address: str) -> None:
         self.port = port  # a serial.SerialBase: for what only serial lines have, speed and break
         self.address = address
-        port.write_timeout = SEND_TIMEOUT_S
 
     def send(self, data: bytes) -> None:
         try:
@@ -107,21 +107,21 @@ class SerialLink:
             raise LinkLost(f"{self.address}: {_words(reason)}") from reason
 
     def receive(self, timeout_s: float) -> bytes:
+        # The port's own timeout never changes: over RFC 2217 each change negotiates every setting anew.
+        deadline = time.perf_counter() + timeout_s
         try:
-            waiting = min(self.port.in_waiting, RECEIVE_BYTES)
-            if not waiting:
-                self.port.timeout = max(0.0, timeout_s)
-                first = bytes(self.port.read(1))
-                waiting = min(self.port.in_waiting, RECEIVE_BYTES) if first else 0
-            else:
-                first = b""
-            self.port.timeout = 0.0
-            return first + bytes(self.port.read(waiting)) if waiting else first
-        except (
-            OSError,
-            ValueError,
-            TypeError,
-        ) as reason:  # pyserial raises TypeError on a port closed meanwhile
+            while True:
+                waiting = min(self.port.in_waiting, RECEIVE_BYTES)
+                if waiting:
+                    return bytes(self.port.read(waiting))
+                if time.perf_counter() >= deadline:
+                    return b""
+                first = bytes(self.port.read(1))  # SERIAL_WAIT_S at most
+                if first:
+                    waiting = min(self.port.in_waiting, RECEIVE_BYTES)
+                    return first + bytes(self.port.read(waiting)) if waiting else first
+        except (OSError, ValueError, TypeError) as reason:
+            # pyserial raises TypeError on a port that was closed meanwhile
             raise LinkLost(f"{self.address}: {_words(reason)}") from reason
 
     def close(self) -> None:
@@ -137,8 +137,9 @@ def open_serial(path: str, baud: int = 9600) -> SerialLink:
     import serial
 
     try:
-        options = {} if "://" in path else {"exclusive": True}
-        port = serial.serial_for_url(path, baudrate=baud, timeout=0.0, **options)
+        # Only ports of this host can be locked, or give up writing: a network's own end does that elsewhere.
+        options = {} if "://" in path else {"exclusive": True, "write_timeout": SEND_TIMEOUT_S}
+        port = serial.serial_for_url(path, baudrate=baud, timeout=SERIAL_WAIT_S, **options)
     except (OSError, ValueError) as reason:
         raise LinkLost(f"{path}: {_words(reason)}") from reason
     try:

@@ -234,7 +234,7 @@ def encode_phsr(handles: tuple[PortHandle, ...]) -> str:
 
 @dataclass(frozen=True)
 class ToolInformation:
-    """PHINF option 0001. tool_type: main type, 0x04 a button box; the rest as the tool's memory has it."""
+    """PHINF option 0001. tool_type: main type, 0x03 a button box; the rest as the tool's memory has it."""
 
     tool_type: int
     manufacturer: str
@@ -263,7 +263,7 @@ class PortInformation:
     location: PortLocation | None = None
 
 
-BUTTON_BOX = 0x04
+BUTTON_BOX = 0x03
 PHINF_TOOL, PHINF_PART_NUMBER, PHINF_LOCATION = 0x0001, 0x0004, 0x0020
 _PHINF_SIZES = {0x0001: 33, 0x0002: 8, 0x0004: 20, 0x0008: 2, 0x0010: 2, 0x0020: 14, 0x0040: 2}
 
