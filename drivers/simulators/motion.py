@@ -10,13 +10,16 @@ import numpy as np
 
 from ..frames import FloatArray, Recording
 
+QUARTER_TURN = (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0)
+
 
 @dataclass(slots=True)
 class DeviceFrame:
     """One measurement. number: counted from 1 by the device; time_us: number x period, as real devices stamp.
 
-    positions (coils, 3) mm, NaN = missing; quaternions (coils, 4) as (w, x, y, z) with z = 0 where the
-    recording has none, as coils with five degrees of freedom give them. The arrays belong to the frame.
+    positions (coils, 3) mm, NaN = missing; quaternions (coils, 4) as (w, x, y, z), NaN = missing together
+    with the position; with z = 0 where the recording has none, as coils with five degrees of freedom give
+    them. The arrays belong to the frame.
     """
 
     number: int
@@ -40,10 +43,10 @@ class SimulatedMotion:
         """The device's frame `number`, from 1."""
         index = round((number - 1) * self._step) % len(self._positions)
         positions = np.array(self._positions[index])
-        if self._quaternions is None:
-            quaternions = np.tile([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0], (len(positions), 1))
-        else:
-            quaternions = np.array(self._quaternions[index])
+        quaternions = np.tile(QUARTER_TURN, (len(positions), 1))
+        if self._quaternions is not None:
+            known = np.isfinite(self._quaternions[index]).all(axis=1)
+            quaternions[known] = self._quaternions[index][known]
         quaternions[np.isnan(positions[:, 0])] = np.nan
         return DeviceFrame(number, number * self.period_us, positions, quaternions)
 
