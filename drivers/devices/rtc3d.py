@@ -10,10 +10,10 @@ Sources: NDI's sample client (rtC3Dframe, rtC3Dclient) and what public clients o
 from __future__ import annotations
 
 import struct
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
+from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
 import numpy as np
