@@ -9,6 +9,8 @@ RESET_BACK_S = 0.2
 """A device time that goes back by more begins a new count; by less, the frame is a late one."""
 RESET_BACK_FRAMES = 64
 """The same for a device without a clock."""
+RESET_APART_S = 0.5
+"""Number and time that go on by amounts that differ by more: the number jumped, nothing is missing."""
 LONGEST_GAP_S = 60.0
 LEARN_FROM = 48  # the latest differences decide what the step is
 SURE_AFTER = 3
@@ -71,12 +73,15 @@ class FrameClock:
     def _moved(self, by: int, by_s: float) -> Verdict:
         back = by < 0 or (by == 0 and by_s < 0)
         if back or by_s < -RESET_BACK_S:
-            near = by_s >= -RESET_BACK_S and by >= -RESET_BACK_FRAMES * max(1, self._step)
+            # Of a late frame neither goes on; a number that goes back while time goes on is a new count.
+            near = -RESET_BACK_S <= by_s <= 0 and by >= -RESET_BACK_FRAMES * max(1, self._step)
             return Verdict.LATE if near else Verdict.RESET
         if by_s > LONGEST_GAP_S:
             return Verdict.RESET
         if by > 0:
             frames = round(by / self._step) if self._step else 1
+            if by_s > 0 and self._period_s and frames * self._period_s - by_s > RESET_APART_S:
+                return Verdict.RESET
             self._step = _learned(self._number_steps, by, self._step)
         elif by_s > 0:
             frames = round(by_s / self._period_s) if self._period_s else 1
