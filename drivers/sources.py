@@ -108,7 +108,7 @@ KINDS: tuple[SourceKind, ...] = (
         "carstens://HOST[:30303]",
         "Carstens AG500, AG501 (cs5recorder over TCP)",
         {
-            "layout": "ag500, ag501, ag501-head, ... (default: told by the size)",
+            "layout": "ag500, ag501, ag501-head, ag501-16, ag501-16-head (default: told by the size)",
             "poll": "requests a second (default 250)",
             **_RATE,
         },
@@ -120,7 +120,11 @@ KINDS: tuple[SourceKind, ...] = (
         "udp-json",
         "udp-json://[HOST][:1234]",
         "clients of the paper's authors' live server (JSON over UDP); we are the server",
-        {"reply": "HOST:PORT that is answered (default 127.0.0.1:1235)", **_RATE},
+        {
+            "reply": "HOST:PORT that is answered (default 127.0.0.1:1235)",
+            "indices": "the points' vertices, as in 885,1912,2469, for a client that does not send them",
+            **_RATE,
+        },
         "devices.authors_live:open_authors_live",
         port=1234,
     ),

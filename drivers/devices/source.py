@@ -129,6 +129,8 @@ class DeviceSource:
                     return self._lose(f"{self.address} has sent nothing for {silent_s:.0f} s")
                 return self._note(NoteKind.SILENT, f"{self.address} is silent")
             if isinstance(item, SourceNote):
+                if item.kind is NoteKind.CLOCK_RESET:  # the conversation knows it: no gap is to be counted
+                    self._clock.restart()
                 return item
             self._heard_s = time.perf_counter()
             self._pause_s = FIRST_PAUSE_S
