@@ -9,10 +9,22 @@ from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_packet import OscPacket
 
 from tonguetrack import InputError
-from tonguetrack.tracker.pose import PoseStatus, TrackedPose
-from tonguetrack.tracker.streams.addresses import ADDRESSES, MAX_DATAGRAM_BYTES, find_address, protocol_page
-from tonguetrack.tracker.streams.osc import FrameBundle, info_datagrams, parse_destination
-from tonguetrack.tracker.streams.sink import StreamInfo
+from tonguetrack.tracker.pose import CoilState, PoseStatus, TrackedPose
+from tonguetrack.tracker.streams.addresses import (
+    ADDRESSES,
+    CONTROL_FORMS,
+    MAX_DATAGRAM_BYTES,
+    find_address,
+    protocol_page,
+)
+from tonguetrack.tracker.streams.osc import (
+    CoilStatesDatagram,
+    FrameBundle,
+    info_datagrams,
+    numbers_datagram,
+    parse_destination,
+)
+from tonguetrack.tracker.streams.sink import LiveNumbers, StreamInfo
 
 IMMEDIATELY = 1
 
@@ -215,11 +227,61 @@ def test_an_estimator_without_a_speaker_sends_none():
     assert messages["/tongue/speaker"] == messages["/tongue/coils"] == []
 
 
+# The state of a live run ----------------------------------------------------------------------------
+
+
+def test_the_numbers_of_a_run_are_latencies_and_the_take():
+    numbers = LiveNumbers((0.5, 2.0), (0.125, 0.25), (0.0625, 1.0), "takes/one.xdf", 4711, "the disk is full")
+    assert by_address(strict_bundle(numbers_datagram(numbers))) == {
+        "/tongue/latency": [0.5, 2.0, 0.125, 0.25, 0.0625, 1.0],
+        "/tongue/take": ["takes/one.xdf", 4711, "the disk is full"],
+    }
+
+
+def test_what_is_unknown_is_minus_one_and_no_take_is_an_empty_text():
+    assert by_address(strict_bundle(numbers_datagram(LiveNumbers()))) == {
+        "/tongue/latency": [-1.0] * 6,
+        "/tongue/take": ["", 0, ""],
+    }
+
+
+def test_a_long_path_keeps_its_end_and_a_long_failure_its_beginning():
+    numbers = LiveNumbers(take_path="/much/" * 99 + "take.xdf", take_failure="no space " * 99)
+    datagram = numbers_datagram(numbers)
+    path, _, failure = by_address(strict_bundle(datagram))["/tongue/take"]
+    assert len(datagram) <= MAX_DATAGRAM_BYTES
+    assert path.startswith("...") and path.endswith("/take.xdf") and len(path) == 120
+    assert failure.startswith("no space") and failure.endswith("...") and len(failure) == 120
+
+
+def test_frames_beyond_an_int32_stay_at_the_largest():
+    datagram = numbers_datagram(LiveNumbers(take_frames=2**40))
+    assert by_address(strict_bundle(datagram))["/tongue/take"][1] == 2**31 - 1
+
+
+def test_coil_states_are_written_in_place_and_only_when_they_changed():
+    datagram = CoilStatesDatagram(3)
+    assert datagram.write(np.array([0, 0, 0]))
+    assert not datagram.write(np.array([0, 0, 0]))
+    assert datagram.write(np.array([0, CoilState.WILD, CoilState.RETURNING]))
+    assert strict_bundle(datagram.datagram) == [("/tongue/coilstates", ",iii", [0, 2, 5])]
+
+
+def test_no_coils_have_no_states():
+    assert strict_bundle(CoilStatesDatagram(0).datagram) == [("/tongue/coilstates", ",", [])]
+
+
+def test_more_coils_than_a_datagram_bears_are_refused_in_words():
+    with pytest.raises(InputError, match="states of 400 coils need"):
+        CoilStatesDatagram(400)
+
+
 # The table ------------------------------------------------------------------------------------------
 
 
 def test_everything_that_is_sent_is_in_the_table_with_its_types_and_the_table_has_nothing_else():
     messages = strict_bundle(written(pose_of([0.0] * 12))) + strict_bundle(info_datagrams(info_of())[0])
+    messages += strict_bundle(CoilStatesDatagram(2).datagram) + strict_bundle(numbers_datagram(LiveNumbers()))
     used = set()
     for address, tags, values in messages:
         row = find_address(address)
@@ -242,6 +304,20 @@ def test_the_documentation_is_the_one_that_the_code_makes():
 def test_the_documentation_names_every_status():
     for status in PoseStatus:
         assert f"| {int(status)} | {status.name.lower()}" in protocol_page()
+    for state in CoilState:
+        assert f"| {int(state)} | {state.name.lower()}" in protocol_page()
+
+
+def test_the_documentation_has_every_form_of_control_and_how_to_open_it_safely():
+    page = protocol_page()
+    for form in CONTROL_FORMS:
+        assert f"| `{form.path}` | `{form.type_tags}` |" in page
+    assert "127.0.0.1:9001" in page
+    assert "lets anyone there start and\nstop takes" in page
+
+
+def test_what_a_stream_sends_and_what_a_session_obeys_are_different_addresses():
+    assert not any(find_address(form.path) for form in CONTROL_FORMS)
 
 
 # Destinations ---------------------------------------------------------------------------------------

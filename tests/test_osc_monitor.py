@@ -138,6 +138,44 @@ def test_other_arguments_than_the_tables_are_counted_apart(datagram):
     assert not monitor.streams
 
 
+# What a live run says of itself ---------------------------------------------------------------------
+
+
+def test_coil_states_are_told_by_role_when_they_change():
+    told = []
+    states = [message("/tongue/coilstates", state) for state in (0, 2, 2, 0, 77)]
+    monitor = heard([about(), *states], told=told)
+    assert [sentence for sentence in told if "coils " in sentence] == [
+        "127.0.0.1:50000: coils 1 of 1 trusted",
+        "127.0.0.1:50000: coils 0 of 1 trusted, tip wild",
+        "127.0.0.1:50000: coils 1 of 1 trusted",
+        "127.0.0.1:50000: coils 0 of 1 trusted, tip 77",
+    ]
+    assert "said       coils 0 of 1 trusted, tip 77" in str(monitor)
+
+
+def test_coils_whose_roles_are_not_known_are_numbered():
+    told = []
+    heard([message("/tongue/coilstates", 0, 1, 0)], told=told)
+    assert "coils 2 of 3 trusted, 2 missing" in told[0]
+
+
+def test_a_take_is_told_when_it_starts_fails_or_ends_and_not_at_every_second():
+    told = []
+    takes = [("", 0, ""), ("a.xdf", 1, ""), ("a.xdf", 2, ""), ("a.xdf", 2, "the disk is full"), ("", 0, "")]
+    heard([message("/tongue/take", *values) for values in takes], told=told)
+    assert [sentence.partition(": ")[2] for sentence in told] == [
+        "no take", "take a.xdf", "take a.xdf, FAILED: the disk is full", "no take"
+    ]  # fmt: skip
+
+
+def test_the_stages_of_the_latency_are_shown_with_what_is_unknown_left_open():
+    stages = [-1.0, -1.0, 0.125, 0.25, 0.5, float("nan")]
+    monitor = heard([frame(0), message("/tongue/latency", *stages)])
+    assert "device to host -/-, host to solved 0.12/0.25, solved to sent 0.50/- ms" in str(monitor)
+    assert monitor.as_dict()["addresses"]["/tongue/latency"]["misfits"] == 0
+
+
 # What should not arrive -----------------------------------------------------------------------------
 
 HEADER = b"#bundle\0" + bytes(7) + b"\1"
@@ -187,7 +225,12 @@ def test_bundles_in_bundles_are_followed_only_so_far():
 
 def test_random_damage_to_real_datagrams_never_raises():
     dice = random.Random(3)
-    seeds = [frame(7), about(), message("/x", "text", 1, 2**40, 1.5, b"blob", True, None, [1, 2])]
+    state = (
+        message("/tongue/coilstates", 0, 1),
+        message("/tongue/take", "a", 1, ""),
+        message("/tongue/latency", *[0.5] * 6),
+    )
+    seeds = [frame(7), about(), *state, message("/x", "text", 1, 2**40, 1.5, b"blob", True, None, [1, 2])]
     monitor = Monitor()
     for k in range(20_000):
         damaged = bytearray(dice.choice(seeds))

@@ -15,7 +15,7 @@ from tonguetrack import InputError
 from tonguetrack.tracker.pose import PoseStatus, TrackedPose
 from tonguetrack.tracker.streams import osc
 from tonguetrack.tracker.streams.osc import OscSink
-from tonguetrack.tracker.streams.sink import StreamInfo
+from tonguetrack.tracker.streams.sink import LiveNumbers, StreamInfo
 
 SIZE = 4
 
@@ -132,6 +132,87 @@ def test_a_sink_can_start_again_as_a_new_stream(receiver, sink_to):
     assert frames_of(waiting(receiver)) == [[0, 0.0, 1], [0, 0.0, 1]]
 
 
+def test_the_info_changes_while_the_stream_goes_on(receiver, sink_to, clock):
+    sink = sink_to(address_of(receiver), info(fixed=False))
+    sink.send(pose(device_time_s=7.0))
+    sink.change(info(fixed=True))
+    clock.now_ns += 1_000_000_000
+    sink.send(pose(device_time_s=8.0, speaker_weights=np.full(3, 9.0)))
+    sent = waiting(receiver)
+    about = [found for found in map(messages, sent) if "/tongue/info" in found]
+    assert frames_of(sent) == [[0, 0.0, 1], [1, 1.0, 1]]
+    assert [found["/tongue/info"][6] for found in about] == ["free", "fixed", "fixed"]
+    assert about[-1]["/tongue/speaker"] == [1.0, 1.0, 1.0], "a fixed speaker's weights are those of the info"
+
+
+# The state of a live run ------------------------------------------------------------------------------
+
+
+def states(*numbers):
+    return pose(coil_states=np.array(numbers, np.int64))
+
+
+def kinds_of(datagrams):
+    """One word a datagram, and what it says of the coils."""
+    named = {"/tongue/info": "info", "/tongue/frame": "frame", "/tongue/take": "numbers"}
+    found = []
+    for datagram in map(messages, datagrams):
+        found += [word for path, word in named.items() if path in datagram]
+        found += [datagram[path] for path in datagram if path == "/tongue/coilstates"]
+    return found
+
+
+def test_coil_states_are_sent_with_the_frame_in_which_they_change(receiver, sink_to, clock):
+    sink = sink_to(address_of(receiver))
+    for state in (0, 0, 2, 2, 0):
+        clock.now_ns += 4_000_000
+        sink.send(states(state))
+    assert kinds_of(waiting(receiver)) == (
+        ["info", "frame", [0], "frame", "frame", [2], "frame", "frame", [0]]
+    )
+
+
+def test_coil_states_are_repeated_every_second(receiver, sink_to, clock):
+    sink = sink_to(address_of(receiver))
+    for _ in range(20):
+        clock.now_ns += 100_000_000
+        sink.send(states(1))
+    assert kinds_of(waiting(receiver)).count([1]) == 3
+
+
+def test_without_watched_coils_nothing_is_said_of_their_states(receiver, sink_to, clock):
+    sink = sink_to(address_of(receiver))
+    clock.now_ns += 1_000_000_000
+    sink.send(pose())
+    assert kinds_of(waiting(receiver)) == ["info", "frame", "info"]
+
+
+def test_a_new_stream_says_the_states_again(receiver, sink_to):
+    sink = sink_to(address_of(receiver))
+    sink.send(states(0))
+    sink.start(info())
+    sink.send(states(0))
+    assert kinds_of(waiting(receiver)).count([0]) == 2
+
+
+def test_the_numbers_of_the_run_are_asked_for_once_a_second(receiver, sink_to, clock):
+    sink = sink_to(address_of(receiver))
+    asked = []
+
+    def numbers():
+        asked.append(clock.now_ns)
+        return LiveNumbers((0.5, 1.0), (0.25, 0.5), (None, None), "one.xdf", 100 * len(asked))
+
+    sink.numbers = numbers
+    for _ in range(30):
+        clock.now_ns += 100_000_000
+        sink.send(pose())
+    found = [about for about in map(messages, waiting(receiver)) if "/tongue/take" in about]
+    assert len(asked) == 3
+    assert [about["/tongue/take"] for about in found] == [["one.xdf", 100 * k, ""] for k in (1, 2, 3)]
+    assert found[0]["/tongue/latency"] == [0.5, 1.0, 0.25, 0.5, -1.0, -1.0]
+
+
 # Peers that are not as one would wish -----------------------------------------------------------------
 
 
@@ -184,9 +265,10 @@ def test_whatever_the_system_refuses_is_a_dropped_frame(sink_to, code):
 
     sink.close()
     sink._socket = Refusing()
-    for _ in range(3):
-        sink.send(pose())
+    for state in range(3):
+        sink.send(states(state))
     sink.start(info())
+    sink.change(info())
     assert (sink.sent, sink.dropped) == (0, 3)
 
 

@@ -44,13 +44,16 @@ def run_monitor(args: argparse.Namespace) -> int:
         print(protocol_page(), end="")
         return 0
     import logging
+    import socket
 
     from ..streams.monitor import Monitor
+    from ..streams.osc import listening_socket
 
     logging.getLogger().addHandler(logging.NullHandler())  # python-osc logs what we count
-    receiver = listening_socket(args.listen)
+    receiver = listening_socket(args.listen, "--listen")
+    receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
     monitor = Monitor(tell=_say)
-    _say(f"listening on {args.listen}; Ctrl-C ends")
+    _say(f"listening on {args.listen.rpartition(':')[0]}:{receiver.getsockname()[1]}; Ctrl-C ends")
     try:
         _listen(receiver, monitor, args.seconds)
     except KeyboardInterrupt:
@@ -59,31 +62,6 @@ def run_monitor(args: argparse.Namespace) -> int:
         receiver.close()
     print(json.dumps(monitor.as_dict(), indent=2, allow_nan=False) if args.json else monitor, flush=True)
     return 0
-
-
-def listening_socket(address: str) -> socket.socket:
-    """A bound UDP socket. Raises InputError where the address is not this machine's or the port is taken."""
-    import errno
-    import socket
-
-    from ... import InputError
-    from ..streams.osc import resolve
-
-    family, place = resolve(address)
-    receiver = socket.socket(family, socket.SOCK_DGRAM)
-    try:
-        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        receiver.bind(place)
-    except OSError as reason:
-        receiver.close()
-        if reason.errno == errno.EADDRINUSE:
-            raise InputError(
-                f"{address}: the port is in use by another program; end that one or give another --listen."
-            ) from reason
-        raise InputError(
-            f"{address}: cannot listen there ({reason.strerror}); give another --listen."
-        ) from reason
-    return receiver
 
 
 def _listen(receiver: socket.socket, monitor: Monitor, seconds: float | None) -> None:

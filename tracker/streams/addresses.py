@@ -9,8 +9,11 @@ from functools import cached_property
 PROTOCOL_NAME = "tonguetrack"
 PROTOCOL_VERSION = 1
 MAX_DATAGRAM_BYTES = 1400
+MAX_CONTROL_TEXT = 200
+DEFAULT_CONTROL_PORT = 9001
 INFO_PERIOD_S = 1.0
 NO_RESIDUAL = -1.0
+NO_LATENCY = -1.0
 SPEAKER_FIXED, SPEAKER_FREE = "fixed", "free"
 
 _VALUE_TYPES: dict[str, tuple[type, ...]] = {"i": (int,), "f": (float,), "s": (str,)}
@@ -144,9 +147,72 @@ SPREAD = Address(
     "The standard deviation of each coefficient.",
 )
 
+LATENCY = Address(
+    "/tongue/latency",
+    tuple(
+        Argument(f"{stage} {percentile}", "f", "ms")
+        for stage in ("device to host", "host to solved", "solved to sent")
+        for percentile in ("p50", "p99")
+    ),
+    "every second, in a live run",
+    "Where the time goes, since the start of the run: how much later than the earliest the frames come from the "
+    "device, from a frame's arrival to its pose, from there until it was sent. -1 where it is not known.",
+)
+COIL_STATES = Address(
+    "/tongue/coilstates",
+    (Argument("state", "i", count="n"),),
+    "every second, and with the frame in which one changes",
+    "What became of each coil, in the order of `/tongue/coils`: see below. Not sent where coils are not watched.",
+)
+TAKE = Address(
+    "/tongue/take",
+    (Argument("path", "s"), Argument("frames", "i"), Argument("failure", "s")),
+    "every second, in a live run",
+    "The take that is being written, an empty text where there is none; the frames in it; why it is no longer "
+    "written, an empty text as long as nothing is wrong. Long texts are cut.",
+)
+
 FRAME_ADDRESSES = (FRAME, POSE, SIGMA, POSE_SCALAR, SIGMA_SCALAR, QUALITY)
 INFO_ADDRESSES = (INFO, COILS, SPEAKER, MEAN, SPREAD)
-ADDRESSES = FRAME_ADDRESSES + INFO_ADDRESSES
+STATE_ADDRESSES = (LATENCY, COIL_STATES, TAKE)
+ADDRESSES = FRAME_ADDRESSES + INFO_ADDRESSES + STATE_ADDRESSES
+
+
+@dataclass(frozen=True)
+class ControlForm:
+    """One form of a message that a running session obeys. does: what happens then."""
+
+    path: str
+    arguments: tuple[Argument, ...]
+    does: str
+
+    @property
+    def type_tags(self) -> str:
+        return "," + "".join(argument.tag for argument in self.arguments)
+
+
+_NAME = Argument("name", "s")
+_ON = Argument("1 or 0", "i")
+_WORD = Argument("start or stop", "s")
+_MARKER = Argument("text", "s")
+
+CONTROL_TAKE = "/tongue/control/take"
+CONTROL_MARKERS = ("/tongue/control/marker", "/marker")
+CONTROL_SPEAKER = "/tongue/control/speaker"
+CONTROL_FORMS = (
+    ControlForm(CONTROL_TAKE, (_ON,), "1 starts a take, 0 ends it"),
+    ControlForm(
+        CONTROL_TAKE, (_ON, _NAME), "the same; the name is that of the take, letters, digits and ` _-.` only"
+    ),
+    ControlForm(CONTROL_TAKE, (_WORD,), "the same in words"),
+    ControlForm(CONTROL_TAKE, (_WORD, _NAME), "the same in words"),
+    *(ControlForm(path, (_MARKER,), "puts a marker into the take") for path in CONTROL_MARKERS),
+    ControlForm(
+        CONTROL_SPEAKER,
+        (Argument("fix or free", "s"),),
+        "holds the speaker's weights as they are now, or estimates them on",
+    ),
+)
 
 
 def find_address(path: str) -> Address | None:
@@ -163,6 +229,15 @@ def address_table() -> str:
     return "\n".join(lines)
 
 
+def control_table() -> str:
+    """The messages that a session obeys, in Markdown."""
+    lines = ["| address | types | arguments | what it does |", "|---|---|---|---|"]
+    for form in CONTROL_FORMS:
+        arguments = ", ".join(map(str, form.arguments))
+        lines.append(f"| `{form.path}` | `{form.type_tags}` | {arguments} | {form.does} |")
+    return "\n".join(lines)
+
+
 def protocol_page() -> str:
     """The whole of docs/osc.md."""
     return f"""# The OSC stream
@@ -170,7 +245,8 @@ def protocol_page() -> str:
 This page is made by `tonguetrack monitor --addresses > docs/osc.md`; change it in
 `tracker/streams/addresses.py`.
 
-`tonguetrack demo` and `tonguetrack track --osc HOST:PORT` send OSC 1.0 over UDP, by default to 127.0.0.1:9000.
+`tonguetrack live`, `tonguetrack demo` and `tonguetrack track --osc HOST:PORT` send OSC 1.0 over UDP, by default
+to 127.0.0.1:9000.
 Every frame is one bundle, every bundle one datagram of at most {MAX_DATAGRAM_BYTES} bytes. All time tags are
 "immediately"; when a frame was captured is an argument. Nothing is expected back: a receiver that is absent,
 late or slow changes nothing for the sender.
@@ -195,6 +271,17 @@ one-value addresses are left out when a frame would not fit otherwise (K above 1
 | 2 | held: no coil in this frame; the pose is the previous one |
 | 3 | relaxing: no coil for longer; the pose drifts back to the mean |
 
+| coil state | meaning |
+|---|---|
+| 0 | trusted: it has its part in the pose |
+| 1 | missing: the source has no position for it |
+| 2 | wild: it moved faster than any tongue |
+| 3 | misfit: it lies much farther from the model than it used to |
+| 4 | stuck: it repeats one position while others move |
+| 5 | returning: it behaves again, but not yet for long enough |
+
+Coils in a state above 0 have no part in the pose. They come back by themselves.
+
 No argument is ever NaN or infinite. The time is a 32-bit float: exact to 0.25 ms within the first hour, to
 4 ms within the first day; the sequence number is exact and begins again at 0 after 2^31 frames.
 A sequence number of 0 is the start of a stream.
@@ -209,4 +296,18 @@ dispatcher = Dispatcher()
 dispatcher.map("/tongue/pose", lambda address, *weights: print(weights))
 BlockingOSCUDPServer(("127.0.0.1", 9000), dispatcher).serve_forever()
 ```
+
+## Control
+
+`tonguetrack live` also listens for OSC over UDP, at 127.0.0.1:{DEFAULT_CONTROL_PORT} unless told otherwise.
+
+{control_table()}
+
+Messages may come alone or in bundles, whose time tags are ignored, in datagrams of at most {MAX_DATAGRAM_BYTES} bytes.
+Texts have at most {MAX_CONTROL_TEXT} printable characters. There is no answer. What is not in the table, has other arguments or is
+not OSC is counted and otherwise ignored; whether a take runs is in `/tongue/take`.
+
+It listens on this computer only. OSC knows no passwords: opened to a network, it lets anyone there start and
+stop takes. Give it the address of one network interface of this computer only where you trust everyone in that
+network, or let the firewall pass the one machine that is to control it, and never open it to the internet.
 """

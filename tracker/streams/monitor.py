@@ -11,7 +11,8 @@ from typing import Any
 from pythonosc.osc_packet import OscPacket, ParseError
 
 from ..latency import NS_PER_MS, LogHistogram, latency_histogram, percentiles_text
-from .addresses import FRAME, INFO, QUALITY, find_address
+from ..pose import CoilState
+from .addresses import COIL_STATES, COILS, FRAME, INFO, LATENCY, QUALITY, TAKE, Address, find_address
 
 MAX_BYTES = 8192
 """Longer datagrams are counted and not taken apart: ours have at most 1400 bytes."""
@@ -61,6 +62,7 @@ class Stream:
     """The sequence numbers of one sender, and what it says of itself.
 
     lost: missing so far (`missing`: the newest of them); late: came after a newer one; repeated: came twice, or long after.
+    said: what it said last about its coils and its take, in words, by address.
     """
 
     newest: int | None = None
@@ -71,6 +73,7 @@ class Stream:
     starts: int = 0
     info: dict[str, object] = field(default_factory=dict)
     missing: dict[int, None] = field(default_factory=dict)
+    said: dict[str, str] = field(default_factory=dict)
 
     def add(self, number: int) -> None:
         self.frames += 1
@@ -170,6 +173,18 @@ class Monitor:
             self._info(values, sender)
         elif row is QUALITY and isinstance(values[2], float) and 0.0 <= values[2] < math.inf:
             self.latency_ns.add(values[2] * NS_PER_MS)
+        elif row is COIL_STATES:
+            coils = self.seen.get(COILS.path, Seen()).fitting
+            self._said(row, _coil_states_text(coils, values), sender)
+        elif row is TAKE:
+            self._said(row, _take_text(values), sender)
+
+    def _said(self, row: Address, words: str, sender: Sender) -> None:
+        """Tells what became of the coils or the take, where it is another than before."""
+        stream = self._stream(sender)
+        if stream is not None and words != stream.said.get(row.path):
+            stream.said[row.path] = words
+            self._tell(f"{_shown(sender)}: {words}")
 
     def _stream(self, sender: Sender) -> Stream | None:
         if sender not in self.streams and len(self.streams) == MAX_SENDERS:
@@ -256,6 +271,10 @@ class Monitor:
         if self.latency_ns.count:
             shown = percentiles_text(self.latency_ns.as_dict(NS_PER_MS), "ms")
             lines.append(f"latency    {shown} (arrival at the tracker until written)")
+        if stages := self.seen.get(LATENCY.path, Seen()).fitting:
+            lines.append(f"stages     {_stages_text(stages)}")
+        for stream in self.streams.values():
+            lines += [f"said       {words}" for words in stream.said.values()]
         if self.seen:
             width = max(len(path) for path in self.seen)
             lines.append(f"{'address':<{width}}    count  per s  last")
@@ -268,6 +287,32 @@ class Monitor:
         if self.unknown_beyond:
             lines.append(f"unknown    further addresses: {self.unknown_beyond}")
         return "\n".join(lines)
+
+
+def _coil_states_text(roles: list[Any], states: list[Any]) -> str:
+    """ "coils 2 of 3 trusted, tongue_tip missing"; coils are numbered where their roles have not arrived yet."""
+    names = roles if len(roles) == len(states) else range(1, len(states) + 1)
+    known = {int(state): state.name.lower() for state in CoilState}
+    out = [
+        f"{_printable(str(name))} {known.get(state, state)}"
+        for name, state in zip(names, states, strict=True)
+        if state != CoilState.TRUSTED
+    ]
+    return ", ".join([f"coils {len(states) - len(out)} of {len(states)} trusted", *out])
+
+
+def _take_text(values: list[Any]) -> str:
+    path, _, failure = values
+    said = f"take {_printable(path)}" if path else "no take"
+    return f"{said}, FAILED: {_printable(failure)}" if failure else said
+
+
+def _stages_text(values: list[Any]) -> str:
+    """Pairs of p50 and p99, - where unknown."""
+    numbers = [f"{value:.2f}" if 0.0 <= value < math.inf else "-" for value in values]
+    stages = ("device to host", "host to solved", "solved to sent")
+    pairs = zip(stages, numbers[::2], numbers[1::2], strict=True)
+    return ", ".join(f"{stage} {p50}/{p99}" for stage, p50, p99 in pairs) + " ms (p50/p99, by the sender)"
 
 
 def _shown(sender: Sender) -> str:

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
 from ... import InputError
 from ..pose import FloatArray, TrackedPose
 from .addresses import (
+    COIL_STATES,
     COILS,
     FRAME,
     INFO,
     INFO_PERIOD_S,
+    LATENCY,
     MAX_DATAGRAM_BYTES,
     MEAN,
+    NO_LATENCY,
     NO_RESIDUAL,
     POSE,
     POSE_SCALAR,
@@ -33,9 +38,10 @@ from .addresses import (
     SPEAKER_FIXED,
     SPEAKER_FREE,
     SPREAD,
+    TAKE,
     Address,
 )
-from .sink import StreamInfo
+from .sink import LiveNumbers, StreamInfo
 
 DEFAULT_DESTINATION = "127.0.0.1:9000"
 MAX_NAME_LENGTH = 120
@@ -128,17 +134,57 @@ def info_datagrams(info: StreamInfo) -> list[bytes]:
     return [_bundle(group) for group in groups]
 
 
+class CoilStatesDatagram:
+    """The datagram with the state of every coil; `write` replaces the numbers in place and says whether one changed."""
+
+    def __init__(self, coils: int) -> None:
+        datagram = bytearray(_bundle([_message(COIL_STATES, [0] * coils)]))
+        if len(datagram) > MAX_DATAGRAM_BYTES:
+            raise InputError(
+                f"the states of {coils} coils need {len(datagram)} bytes, more than an OSC datagram of "
+                f"{MAX_DATAGRAM_BYTES} holds; track fewer coils."
+            )
+        self.datagram = datagram
+        self.coils = coils
+        self._words = np.frombuffer(datagram, ">i4")[len(datagram) // 4 - coils :]
+        self._written = b""
+
+    def write(self, states: NDArray[np.int64]) -> bool:
+        """states: (coils,). The first call changes them all."""
+        # As bytes: a tenth of the time of an element-wise comparison, and no array is made.
+        current = states.tobytes()
+        if current == self._written:
+            return False
+        self._written = current
+        self._words[:] = states
+        return True
+
+
+def numbers_datagram(numbers: LiveNumbers) -> bytes:
+    """What a live run says of itself, as one bundle."""
+    pairs = (numbers.device_to_host_ms, numbers.host_to_solved_ms, numbers.solved_to_sent_ms)
+    latencies = [NO_LATENCY if value is None else value for pair in pairs for value in pair]
+    take = [
+        _osc_text(numbers.take_path, cut_front=True),
+        min(numbers.take_frames, _SEQUENCE_MASK),
+        _osc_text(numbers.take_failure),
+    ]
+    return _bundle([_message(LATENCY, latencies), _message(TAKE, take)])
+
+
 class OscSink:
     """Sends every pose to one UDP destination, without ever waiting for it.
 
     The socket is not connected and does not block: whatever the network answers, a frame is either handed
     to the operating system or counted in `dropped`. The destination's name is looked up once, here.
+    numbers: asked once a second, in the thread that sends, for what a live run says of itself; None = nothing.
     """
 
     def __init__(self, destination: str = DEFAULT_DESTINATION) -> None:
         self.destination = f"osc {destination}"
         self.sent = 0
         self.dropped = 0
+        self.numbers: Callable[[], LiveNumbers] | None = None
         family, self._peer = resolve(destination)
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
@@ -147,6 +193,7 @@ class OscSink:
         self._bundle: FrameBundle | None = None
         self._info: list[bytearray] = []
         self._speaker_words: FloatArray | None = None
+        self._states: CoilStatesDatagram | None = None
         self._sequence = 0
         self._start_s: float | None = None
         self._next_info_ns = 0
@@ -154,21 +201,30 @@ class OscSink:
     def start(self, info: StreamInfo) -> None:
         """Builds the datagrams and sends the info for the first time."""
         self._bundle = FrameBundle(len(info.mean))
+        self._states = CoilStatesDatagram(len(info.roles))
+        self._sequence = 0
+        self._start_s = None
+        self.change(info)
+
+    def change(self, info: StreamInfo) -> None:
+        """Another info for the stream that runs, whose sequence numbers and time go on. Sends it at once.
+
+        The model must be the same one.
+        """
         self._info = [bytearray(datagram) for datagram in info_datagrams(info)]
         count = len(info.speaker_weights)
+        self._speaker_words = None
         if count and not info.speaker_fixed:
             # The speaker's message is the first: its weights end where its element ends.
             element = int.from_bytes(self._info[0][_BUNDLE_HEADER_BYTES:][:_ELEMENT_HEADER_BYTES], "big")
             end = _BUNDLE_HEADER_BYTES + _ELEMENT_HEADER_BYTES + element
             self._speaker_words = np.frombuffer(self._info[0], ">f4")[end // 4 - count : end // 4]
-        self._sequence = 0
-        self._start_s = None
         self._send_info()
 
     def send(self, pose: TrackedPose) -> None:
         """Writes and sends one frame; afterwards the info, when a second has passed."""
-        bundle = self._bundle
-        assert bundle is not None, "start() comes before send()"
+        bundle, states = self._bundle, self._states
+        assert bundle is not None and states is not None, "start() comes before send()"
         if self._start_s is None:
             self._start_s = pose.device_time_s
         now_ns = time.perf_counter_ns()
@@ -181,10 +237,17 @@ class OscSink:
             self.sent += 1
         except OSError:  # buffer full, nobody there, network gone: the next frame is newer anyway
             self.dropped += 1
-        if now_ns >= self._next_info_ns:
+        states_known = len(pose.coil_states) == states.coils > 0
+        states_changed = states_known and states.write(pose.coil_states)
+        second_is_over = now_ns >= self._next_info_ns
+        if states_changed or (states_known and second_is_over):
+            self._send_aside(states.datagram)
+        if second_is_over:
             if self._speaker_words is not None:
                 self._speaker_words[:] = pose.speaker_weights
             self._send_info()
+            if self.numbers is not None:
+                self._send_aside(numbers_datagram(self.numbers()))
 
     def close(self) -> None:
         self._socket.close()
@@ -192,13 +255,16 @@ class OscSink:
     def _send_info(self) -> None:
         self._next_info_ns = time.perf_counter_ns() + int(INFO_PERIOD_S * 1e9)
         for datagram in self._info:
-            try:
-                self._socket.sendto(datagram, self._peer)
-            except OSError:  # it is sent again in a second
-                pass
+            self._send_aside(datagram)
+
+    def _send_aside(self, datagram: bytes | bytearray) -> None:
+        try:
+            self._socket.sendto(datagram, self._peer)
+        except OSError:  # it is sent again in a second
+            pass
 
 
-def parse_destination(text: str) -> tuple[str, int]:
+def parse_destination(text: str, lowest_port: int = 1) -> tuple[str, int]:
     """ "127.0.0.1:9000", "name:9000" or "[::1]:9000" as host and port."""
     host, colon, port = text.strip().rpartition(":")
     if host.startswith("[") and host.endswith("]"):
@@ -207,21 +273,42 @@ def parse_destination(text: str) -> tuple[str, int]:
         raise InputError(f"'{text}': an IPv6 address stands in brackets, as in [::1]:9000.")
     if not colon or not host or any(c.isspace() or c in "/[]" for c in host):
         raise InputError(f"'{text}': expected HOST:PORT, as in {DEFAULT_DESTINATION}.")
-    if not (port.isascii() and port.isdigit() and 1 <= int(port) <= 65535):
-        raise InputError(f"'{text}': the port '{port}' should be a number from 1 to 65535.")
+    if not (port.isascii() and port.isdigit() and lowest_port <= int(port) <= 65535):
+        raise InputError(f"'{text}': the port '{port}' should be a number from {lowest_port} to 65535.")
     return host, int(port)
 
 
-def resolve(text: str) -> tuple[socket.AddressFamily, tuple[object, ...]]:
+def resolve(text: str, lowest_port: int = 1) -> tuple[socket.AddressFamily, tuple[object, ...]]:
     """HOST:PORT as the address family and the numeric address that sockets take; IPv4 where there is a choice,
     because that is where receivers listen when someone says localhost."""
-    host, port = parse_destination(text)
+    host, port = parse_destination(text, lowest_port)
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as reason:
         raise InputError(f"'{text}': the host '{host}' is not known here; check its name.") from reason
     family, _, _, _, address = min(found, key=lambda entry: entry[0] != socket.AF_INET)
     return family, address
+
+
+def listening_socket(address: str, option: str) -> socket.socket:
+    """A bound UDP socket; port 0 is any that is free. option: where else a user may name another address.
+
+    Raises InputError where the address is not this machine's or the port is taken.
+    """
+    family, place = resolve(address, lowest_port=0)
+    receiver = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        receiver.bind(place)
+    except OSError as reason:
+        receiver.close()
+        if reason.errno == errno.EADDRINUSE:
+            raise InputError(
+                f"{address}: the port is in use by another program; end that one or give another {option}."
+            ) from reason
+        raise InputError(
+            f"{address}: cannot listen there ({reason.strerror}); give another {option}."
+        ) from reason
+    return receiver
 
 
 def _message(row: Address, values: Iterable[Any], path: str = "") -> bytes:
@@ -249,7 +336,10 @@ def _bundle(messages: Sequence[bytes]) -> bytes:
     return bytes(builder.build().dgram)
 
 
-def _osc_text(text: str) -> str:
+def _osc_text(text: str, cut_front: bool = False) -> str:
     """OSC strings are ASCII without zeros; names of people's files are cut to what a datagram bears."""
     plain = text.encode("ascii", "replace").decode().replace("\0", "?")
-    return plain if len(plain) <= MAX_NAME_LENGTH else plain[: MAX_NAME_LENGTH - 3] + "..."
+    if len(plain) <= MAX_NAME_LENGTH:
+        return plain
+    kept = MAX_NAME_LENGTH - 3
+    return "..." + plain[-kept:] if cut_front else plain[:kept] + "..."

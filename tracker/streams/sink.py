@@ -27,6 +27,28 @@ class StreamInfo:
     rate_hz: float
 
 
+Pair = tuple[float | None, float | None]
+"""p50 and p99, None = unknown."""
+
+
+@dataclass(frozen=True)
+class LiveNumbers:
+    """What a live run says of itself once a second.
+
+    device_to_host_ms: how much later than the earliest the frames arrive, by the device's clock; host_to_solved_ms:
+    from a frame's arrival to its pose; solved_to_sent_ms: from there until every sink had it.
+    take_path: of the take that is being written, "" = none; take_frames: in it so far; take_failure: why it is
+    no longer written, "" = nothing is wrong.
+    """
+
+    device_to_host_ms: Pair = (None, None)
+    host_to_solved_ms: Pair = (None, None)
+    solved_to_sent_ms: Pair = (None, None)
+    take_path: str = ""
+    take_frames: int = 0
+    take_failure: str = ""
+
+
 class Sink(Protocol):
     """Where poses go. `send` is called in the loop's thread: it must neither wait nor raise for a peer.
 
@@ -48,6 +70,9 @@ class Sink(Protocol):
 
     def start(self, info: StreamInfo) -> None:
         """Called once, before the first frame: everything that takes time happens here."""
+
+    def change(self, info: StreamInfo) -> None:
+        """Called in the loop's thread when the info is another one, as when the speaker was fixed. The model stays."""
 
     def send(self, pose: TrackedPose) -> None:
         """Called for every frame."""
