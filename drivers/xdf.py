@@ -259,14 +259,17 @@ class XdfStream:
 class XdfFile:
     """A file as far as it is whole.
 
-    spans: (begin, end) of the stretches of whole chunks, the first from the first chunk on. fields: of the
-    file's header. damages: sentences without the file's name.
+    fields: of the file's header. spans: (begin, end) of the stretches of whole chunks, the first from the first
+    chunk on. headers_end: where the headers at the beginning end. footers: (begin, end) of each footer's chunk.
+    damages: sentences without the file's name.
     """
 
     streams: list[XdfStream]
     fields: Mapping[str, str]
     size: int
     spans: list[tuple[int, int]]
+    headers_end: int
+    footers: list[tuple[int, int]]
     damages: list[str]
 
     @property
@@ -335,6 +338,8 @@ class _Reader:
         self._states: dict[int, _State] = {}
         self._fields: dict[str, str] = {}
         self._damages: list[str] = []
+        self._headers_end = len(MAGIC)
+        self._footers: list[tuple[int, int]] = []
 
     def read(self) -> XdfFile:
         position = begin = len(MAGIC)
@@ -343,7 +348,7 @@ class _Reader:
         while position < size:
             try:
                 start, end = self._bounds(position)
-                self._read_chunk(start, end, position)
+                tag = self._read_chunk(start, end, position)
             except _Damaged as reason:
                 if position > begin or not spans:
                     spans.append((begin, position))
@@ -356,12 +361,16 @@ class _Reader:
                 self._tell(f"the chunk at byte {position} is damaged ({reason}); read on from {found.end()}")
                 begin = position = found.end()
             else:
+                if tag <= STREAM_HEADER and position == self._headers_end:
+                    self._headers_end = end
+                elif tag == STREAM_FOOTER:
+                    self._footers.append((position, end))
                 position = end
         if position > begin or not spans:
             spans.append((begin, position))
         self._compare_with_footers()
         streams = [state.stream for state in self._states.values()]
-        return XdfFile(streams, self._fields, size, spans, self._damages)
+        return XdfFile(streams, self._fields, size, spans, self._headers_end, self._footers, self._damages)
 
     def _tell(self, sentence: str) -> None:
         if len(self._damages) < MAX_DAMAGES:
@@ -395,8 +404,9 @@ class _Reader:
             raise _CutOff(f"a chunk of {length} bytes, of which {size - start} are there")
         return start, start + length
 
-    def _read_chunk(self, start: int, end: int, position: int) -> None:
-        tag = struct.unpack_from("<H", self._view, start)[0]
+    def _read_chunk(self, start: int, end: int, position: int) -> int:
+        """Takes in what the chunk holds; its tag."""
+        tag: int = struct.unpack_from("<H", self._view, start)[0]
         start += 2
         if tag == FILE_HEADER:
             self._fields.update(_leaves(self._xml(start, end)))
@@ -412,7 +422,7 @@ class _Reader:
             if tag == STREAM_HEADER:
                 if state is not None:
                     self._tell(f"the chunk at byte {position} is a second header of stream {stream_id}")
-                    return
+                    return tag
                 self._states[stream_id] = _new_state(stream_id, self._xml(start, end))
             elif state is None:
                 self._tell(f"the chunk at byte {position} belongs to stream {stream_id}, which has no header")
@@ -425,6 +435,7 @@ class _Reader:
                     raise _Damaged("a clock offset of another size")
                 state.stream.clock_offsets.append(struct.unpack_from("<dd", self._view, start))
         # Other tags are of a later version; a reader of this one passes over them.
+        return tag
 
     def _xml(self, start: int, end: int) -> ElementTree.Element:
         if end - start > MAX_XML_BYTES:

@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -70,49 +72,74 @@ def _from_take(raw: XdfStream, file: XdfFile, name: str, options: Options) -> Re
         raise InputError(f"{name}: the take's description is damaged ({str(reason)[:80]}).") from reason
     if not _are_texts(coils) or not _are_texts(frame) or len(frame) != 4 or len(parts) != 3:
         raise InputError(f"{name}: the take's description is damaged.")
-    widths = [
-        2,
-        3 * len(coils),
-        *(w * len(coils) for w, there in zip((4, 1, 1), parts, strict=True) if there),
-    ]
-    if sum(widths) != raw.channel_count or raw.channel_format != "double64":
+    head = TakeHead(tuple(coils), FrameOfReference(*frame), (parts[0], parts[1], parts[2]), raw.rate_hz)
+    if sum(head.widths) != raw.channel_count or raw.channel_format != "double64":
         raise InputError(
             f"{name}: the stream 'raw' has {raw.channel_count} channels of {raw.channel_format}, expected "
-            f"{sum(widths)} of double64."
+            f"{sum(head.widths)} of double64."
         )
     if raw.count == 0:
         raise InputError(f"{name}: the take has no frames{f' ({file.damage})' if file.damage else ''}.")
-    begins = np.cumsum([0, *widths]).tolist()
-    blocks = [raw.columns(range(begin, begin + width)) for begin, width in zip(begins, widths, strict=False)]
-    frames = raw.count
-    rest = blocks[2:]
-    quaternions = rest.pop(0).reshape(frames, -1, 4) if parts[0] else None
-    rms = rest.pop(0) if parts[1] else None
-    status = _words(rest.pop(0)) if parts[2] else None
-    times, rate_hz, notes = _take_times(raw, name, options.rate_hz)
+    notes = []
     if file.damage:
         notes.append(f"Damaged or unfinished: {file.damage}; `tonguetrack take recover` repairs it.")
     elif raw.footer is None:
         notes.append("The take was not finished; every frame in the file was read.")
+    recording = take_recording(head, raw.stamps, raw.columns, name, options.rate_hz)
+    extra = {key: raw.description.get(key, "") for key in ("started", "source", "model_name", "version")}
+    return replace(recording, notes=(*notes, *recording.notes), extra={k: v for k, v in extra.items() if v})
+
+
+@dataclass(frozen=True)
+class TakeHead:
+    """What the channels of a take's `raw` stream are.
+
+    parts: whether there are quaternions, rms and status. rate_hz: nominal, 0.0 = unknown.
+    """
+
+    coils: tuple[str, ...]
+    frame: FrameOfReference
+    parts: tuple[bool, bool, bool]
+    rate_hz: float
+
+    @property
+    def widths(self) -> list[int]:
+        """Channels of device time and number, positions, and each part that is there."""
+        coils = len(self.coils)
+        return [2, 3 * coils, *(w * coils for w, there in zip((4, 1, 1), self.parts, strict=True) if there)]
+
+
+def take_recording(
+    head: TakeHead,
+    stamps: FloatArray,
+    columns: Callable[[range], FloatArray],
+    name: str,
+    asked_hz: float | None = None,
+) -> Recording:
+    """The recording in a take's `raw` stream, bit for bit.
+
+    stamps: (frames,) arrivals, s. columns: gives (frames, len(range)) of the stream. asked_hz: the user's --rate.
+    Raises InputError where neither the device, nor the stamps, nor the user tell the rate.
+    """
+    begins = np.cumsum([0, *head.widths]).tolist()
+    frames, coils = len(stamps), len(head.coils)
+    clock, places, *rest = (columns(range(begin, end)) for begin, end in pairwise(begins))
+    positions = places.reshape(frames, coils, 3)
+    times, rate_hz, notes = _take_times(stamps, head.rate_hz, name, asked_hz)
     return Recording(
-        coils=tuple(coils),
-        positions=blocks[1].reshape(frames, -1, 3),
+        coils=head.coils,
+        positions=positions,
         times_s=times,
         rate_hz=rate_hz,
         format=f"tonguetrack take {TAKE_VERSION} (XDF)",
-        frame=FrameOfReference(*frame),
-        quaternions=quaternions,
-        rms=rms,
+        frame=head.frame,
+        quaternions=rest.pop(0).reshape(frames, coils, 4) if head.parts[0] else None,
+        rms=rest.pop(0) if head.parts[1] else None,
         source=name,
-        notes=(*notes, *coverage_notes(coils, blocks[1].reshape(frames, -1, 3))),
-        extra={
-            key: raw.description[key]
-            for key in ("started", "source", "model_name", "version")
-            if raw.description.get(key)
-        },
-        device_times_s=np.ascontiguousarray(blocks[0][:, 0]),
-        frame_numbers=_whole_numbers(blocks[0][:, 1]),
-        status=status,
+        notes=(*notes, *coverage_notes(head.coils, positions)),
+        device_times_s=np.ascontiguousarray(clock[:, 0]),
+        frame_numbers=_whole_numbers(clock[:, 1]),
+        status=_words(rest.pop(0)) if head.parts[2] else None,
     )
 
 
@@ -128,10 +155,11 @@ def _whole_numbers(values: FloatArray) -> np.ndarray:
     return np.where(np.abs(values) <= _EXACT, values, -1).astype(np.int64)
 
 
-def _take_times(raw: XdfStream, name: str, asked_hz: float | None) -> tuple[FloatArray, float, list[str]]:
+def _take_times(
+    stamps: FloatArray, nominal_hz: float, name: str, asked_hz: float | None
+) -> tuple[FloatArray, float, list[str]]:
     """Seconds since the first frame's arrival, strictly increasing, the rate, and notes."""
-    stamps = raw.stamps
-    usual_hz = asked_hz or raw.rate_hz
+    usual_hz = asked_hz or nominal_hz
     if not np.isfinite(stamps).all():
         if not usual_hz:
             raise InputError(f"{name}: the time stamps are damaged; pass the sampling rate with --rate.")

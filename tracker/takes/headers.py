@@ -22,26 +22,7 @@ def header_bytes(info: TakeInfo) -> bytes:
 
     The header of `raw` describes the whole take, so that it alone tells what a file is.
     """
-    labels = {
-        RAW: info.raw_labels,
-        PREPARED: info.prepared_labels,
-        POSE: info.pose_labels,
-        MARKERS: ("marker",),
-    }
-    return b"".join(
-        stream_header(
-            STREAM_IDS[name],
-            name,
-            STREAM_TYPES[name],
-            labels[name],
-            [_unit(label) for label in labels[name]],
-            0.0 if name == MARKERS else info.rate_hz,
-            info.source,
-            "string" if name == MARKERS else "double64",
-            _description(info) if name == RAW else {},
-        )
-        for name in (RAW, PREPARED, POSE, MARKERS)
-    )
+    return missing_headers(info, ())
 
 
 def info_from_streams(streams: Sequence[XdfStream]) -> TakeInfo:
@@ -69,7 +50,36 @@ def info_from_streams(streams: Sequence[XdfStream]) -> TakeInfo:
                 f"the stream '{name}' has {stream.channel_count} channels of {stream.channel_format}, expected "
                 f"{len(labels)} of double64."
             )
+    if len(info.vertices) != len(info.roles) or len(info.pose_sigma) != len(info.pose_mean):
+        raise InputError(
+            "the take's description is damaged (roles and vertices, or means and sigmas, differ in number)."
+        )
     return info
+
+
+def missing_headers(info: TakeInfo, present: Sequence[str]) -> bytes:
+    """The headers of the streams whose names are not `present`."""
+    return b"".join(_header(info, name) for name in STREAM_IDS if name not in present)
+
+
+def _header(info: TakeInfo, name: str) -> bytes:
+    labels = {
+        RAW: info.raw_labels,
+        PREPARED: info.prepared_labels,
+        POSE: info.pose_labels,
+        MARKERS: ("marker",),
+    }
+    return stream_header(
+        STREAM_IDS[name],
+        name,
+        STREAM_TYPES[name],
+        labels[name],
+        [_unit(label) for label in labels[name]],
+        0.0 if name == MARKERS else info.rate_hz,
+        info.source,
+        "string" if name == MARKERS else "double64",
+        _description(info) if name == RAW else {},
+    )
 
 
 def _description(info: TakeInfo) -> dict[str, str]:
