@@ -15,7 +15,8 @@ from tonguetrack.model.files import load_model
 from tonguetrack.tracker.pose import PoseStatus
 from tonguetrack.tracker.posefiles import write_poses
 from tonguetrack.tracker.session import Alignment, Session
-from tonguetrack.tracker.tracking import Tracker, track_recording
+from tonguetrack.tracker.online import Tracker
+from tonguetrack.tracker.tracking import track_recording
 
 VERTICES = {"tongue_tip": 3, "tongue_blade": 9, "tongue_dorsum": 15}
 

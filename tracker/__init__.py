@@ -12,6 +12,7 @@ ensure_a_writable_cache()
 
 # Loaded when first used: the command line lives below this package and must answer --help at once.
 _HOME_OF = {
+    "Tracker": "online",
     "PoseStatus": "pose",
     "TrackedPose": "pose",
     "TrackedPoses": "pose",
@@ -19,7 +20,6 @@ _HOME_OF = {
     "load_session": "session",
     "Setup": "setup",
     "complete_setup": "setup",
-    "Tracker": "tracking",
     "TrackingRun": "tracking",
     "track_recording": "tracking",
 }

@@ -25,13 +25,13 @@ from ..drivers.frames import Recording
 from ..drivers.replay import ReplaySource
 from ..model.multilinear import Mode, TongueModel
 from .live import run_live, stream_info
+from .online import Tracker
 from .pose import FloatArray
 from .preparation import Preparation
 from .session import Energy, Session
 from .setup import Setup
 from .solver import FixedSpeakerSolver, FreeSpeakerSolver
 from .streams.osc import OscSink
-from .tracking import Tracker
 
 COILS = 5
 NOISE_MM = 0.5

@@ -219,6 +219,25 @@ def coil_residuals(coils, base, directions, weights, residuals):
 
 
 @njit(**OPTIONS)
+def free_residuals(coils, base, core, weights, residuals):
+    """`coil_residuals` for the multilinear model; weights (m + n,) = speaker weights, then pose weights."""
+    speakers, poses, rows = core.shape
+    for i in range(coils.shape[0]):
+        if np.isnan(coils[i, 0]):
+            residuals[i] = np.nan
+            continue
+        squared = 0.0
+        for axis in range(3):
+            row = 3 * i + axis
+            value = base[row] - coils[i, axis]
+            for l in range(speakers):
+                for k in range(poses):
+                    value += weights[l] * weights[speakers + k] * core[l, k, row]
+            squared += value * value
+        residuals[i] = np.sqrt(squared)
+
+
+@njit(**OPTIONS)
 def coil_grams(directions, gram):
     """gram (n, K, K): the products of the directions at each coil, constant for a fixed speaker."""
     size = directions.shape[0]

@@ -1,4 +1,4 @@
-"""The loop: frame in, pose out, datagram sent, in one thread; and what can be said of a run afterwards."""
+"""The loop: frame in, pose out, datagram sent, in one thread."""
 
 from __future__ import annotations
 
@@ -6,149 +6,38 @@ import gc
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-
-from ..drivers.frames import CoilFrame, Recording
+from ..drivers.frames import CoilFrame, NoteKind, Recording, SourceNote
 from ..drivers.replay import ReplaySource
 from ..model.multilinear import TongueModel
-from .latency import NS_PER_MS, NS_PER_US, latency_histogram, percentiles_text, residual_histogram
+from .control import Control, ControlQueue
+from .online import Tracker
 from .pose import PoseStatus, TrackedPose
+from .session import session_toml
 from .setup import Setup
+from .status import LiveStatus, Summary, summarise
 from .streams.osc import OscSink
 from .streams.sink import Sink, StreamInfo
-from .tracking import Tracker
+from .takes.layout import SESSION_MARK, SOURCE_MARK
+
+if TYPE_CHECKING:
+    from .background import BackgroundSpeaker
+    from .takes.keeper import TakeKeeper
+    from .takes.recorder import TakeRecorder
 
 
-class Source(Protocol):
-    """Where frames come from. Iterating waits for the next frame and ends when the source is closed."""
+class FrameSource(Protocol):
+    """As much of `drivers.sources.Source` as the loop needs."""
 
     @property
     def rate_hz(self) -> float: ...
 
-    def __iter__(self) -> Iterator[CoilFrame]: ...
+    def __iter__(self) -> Iterator[CoilFrame | SourceNote]: ...
 
-    def close(self) -> None:
+    def stop(self) -> None:
         """May be called from another thread or a signal handler."""
-
-
-class LiveStatus:
-    """The numbers of a run so far. The loop writes them; a slower thread may read them at any time.
-
-    missing_frames: how many frame numbers the source left out, in `gaps` places.
-    coils_missing: (n,) frames in which each coil was absent; statuses: frames of each `PoseStatus`.
-    """
-
-    def __init__(self, coils: int, sinks: Sequence[Sink] = ()) -> None:
-        self.frames = 0
-        self.first_arrival_ns = self.last_arrival_ns = 0
-        self.first_device_s = self.last_device_s = 0.0
-        self.statuses = [0] * len(PoseStatus)
-        self.status: int = PoseStatus.LOST
-        self.valid_coils = 0
-        self.residual_mm = float("nan")
-        self.gaps = 0
-        self.missing_frames = 0
-        self.solve_ns = latency_histogram()
-        self.arrival_to_sent_ns = latency_histogram()
-        self.residuals = residual_histogram()
-        self.coils_missing = np.zeros(coils, np.int64)
-        self.sinks = tuple(sinks)
-        self._absent = np.zeros(coils, np.bool_)
-        self._last_number = 0
-
-    def add(self, pose: TrackedPose, before_ns: int, sent_ns: int) -> None:
-        """Counts one frame that was handed to the solver at `before_ns` and had left at `sent_ns`."""
-        if self.frames == 0:
-            self.first_arrival_ns = pose.arrival_ns
-            self.first_device_s = pose.device_time_s
-        elif pose.frame_number != self._last_number + 1:
-            self.gaps += 1
-            self.missing_frames += max(0, pose.frame_number - self._last_number - 1)
-        self._last_number = pose.frame_number
-        self.last_arrival_ns = pose.arrival_ns
-        self.last_device_s = pose.device_time_s
-        self.statuses[pose.status] += 1
-        self.status = pose.status
-        self.valid_coils = pose.valid_coils
-        self.residual_mm = pose.residual_mm
-        if pose.valid_coils:
-            self.residuals.add(pose.residual_mm)
-        np.isnan(pose.residuals_mm, out=self._absent)
-        self.coils_missing += self._absent
-        self.solve_ns.add(pose.solved_ns - before_ns)
-        self.arrival_to_sent_ns.add(sent_ns - pose.arrival_ns)
-        self.frames += 1
-
-    @property
-    def dropped(self) -> int:
-        return sum(sink.dropped for sink in self.sinks)
-
-
-@dataclass(frozen=True)
-class SinkSummary:
-    destination: str
-    sent: int
-    dropped: int
-
-
-Percentiles = dict[str, float | int | None]
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What a run was like. Percentiles are dicts of p50, p99, max and count; None = nothing to tell.
-
-    duration_s, rate_hz: by this host's clock; stream_s: by the device's. solve_us: one tracker step;
-    arrival_to_sent_ms: from the frame's arrival until every sink had it; lateness_ms: how late a paced
-    replay handed the frames over, which is before their arrival. coils: share of frames with each coil.
-    """
-
-    model: str
-    frames: int
-    duration_s: float
-    stream_s: float
-    rate_hz: float | None
-    nominal_rate_hz: float
-    speaker_fixed: bool
-    solve_us: Percentiles
-    arrival_to_sent_ms: Percentiles
-    lateness_ms: Percentiles | None
-    residual_mm: dict[str, float | None]
-    status_shares: dict[str, float]
-    coils: dict[str, float]
-    gaps: int
-    missing_frames: int
-    sinks: tuple[SinkSummary, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, text, lists and dicts, without NaN."""
-        return {**asdict(self), "sinks": [asdict(sink) for sink in self.sinks]}
-
-    def __str__(self) -> str:
-        rate = f" ({self.rate_hz:.1f} a second)" if self.rate_hz else ""
-        shares = ", ".join(
-            f"{name} {100 * share:.1f} %" for name, share in self.status_shares.items() if share
-        )
-        coils = ", ".join(f"{role} {100 * share:.0f} %" for role, share in self.coils.items())
-        mean, median = self.residual_mm["mean"], self.residual_mm["median"]
-        lines = [
-            f"frames           {self.frames} in {self.duration_s:.2f} s{rate}",
-            f"status           {shares or 'no frame arrived'}",
-            f"solve            {percentiles_text(self.solve_us, 'us')}",
-            f"arrival to sent  {percentiles_text(self.arrival_to_sent_ms, 'ms')}",
-        ]
-        if self.lateness_ms is not None:
-            lines.append(f"replay late by   {percentiles_text(self.lateness_ms, 'ms')}")
-        if mean is not None and median is not None:
-            lines.append(f"residual         mean {mean:.3f} mm, median {median:.3f} mm")
-        lines.append(f"coils valid      {coils}")
-        lines.append(f"source gaps      {self.gaps} ({self.missing_frames} frames missing)")
-        for sink in self.sinks:
-            lines.append(f"sent             {sink.sent} to {sink.destination}, {sink.dropped} dropped")
-        return "\n".join(lines)
 
 
 def stream_info(model: TongueModel, setup: Setup, rate_hz: float) -> StreamInfo:
@@ -168,26 +57,193 @@ def stream_info(model: TongueModel, setup: Setup, rate_hz: float) -> StreamInfo:
 
 
 def run_live(
-    source: Source,
+    source: FrameSource,
     tracker: Tracker,
     info: StreamInfo,
     sinks: Sequence[Sink] = (),
     status: LiveStatus | None = None,
     seconds: float | None = None,
 ) -> Summary:
-    """Tracks until the source ends or is closed, or has delivered `seconds` by its own clock.
+    """Tracks until the source ends or is stopped, or has delivered `seconds` by its own clock.
 
     Everything is compiled, built and looked up before the first frame is asked for. From then on the
     loop takes no lock, writes no log and keeps nothing; Python's cyclic garbage collector sleeps until the
-    end. The sinks stay open: they belong to the caller. To stop from elsewhere, close the source.
+    end. The sinks stay open: they belong to the caller. To stop from elsewhere, stop the source.
     """
-    status = status or LiveStatus(len(info.roles), sinks)
-    tracker.warm_up()
-    for sink in sinks:
-        sink.start(info)
-    with sleeping_collector():
-        _loop(source, tracker, tuple(sinks), status, float("inf") if seconds is None else seconds)
-    return _summary(source, info, status)
+    status = status or LiveStatus(info.roles, sinks)
+    return LiveRun(source, tracker, info, status, sinks, seconds=seconds).run()
+
+
+@dataclass
+class LiveRun:
+    """A run with everything that a user may do to it while it lasts.
+
+    Sinks and keeper belong to the caller, who closes them. background: estimates the speaker beside the
+    loop until `fix_after_s` of speech were tracked. said: called with what a person should read, from the
+    loop's thread, at rare events only. handles: a command of a client that drives the source; gives the set-up
+    to go on with, or None to end the run.
+    """
+
+    source: FrameSource
+    tracker: Tracker
+    info: StreamInfo
+    status: LiveStatus
+    sinks: Sequence[Sink] = ()
+    keeper: TakeKeeper | None = None
+    controls: ControlQueue = field(default_factory=ControlQueue)
+    background: BackgroundSpeaker | None = None
+    fix_after_s: float = float("inf")
+    seconds: float | None = None
+    said: Callable[[str], None] = lambda text: None
+    handles: Callable[[SourceNote, Tracker], Setup | None] | None = None
+    _followed: object = None  # the estimate that the tracker goes by already
+
+    def run(self) -> Summary:
+        """As `run_live`."""
+        self.tracker.warm_up()
+        for sink in self.sinks:
+            sink.start(self.info)
+        with sleeping_collector():
+            self._loop()
+        takes = self.keeper.finished if self.keeper is not None else ()
+        return summarise(self.info, self.status, _lateness(self.source), takes)
+
+    def _loop(self) -> None:
+        clock, tracker, status, keeper = time.perf_counter_ns, self.tracker, self.status, self.keeper
+        step, add, sinks, controls = tracker.step, status.add, tuple(self.sinks), self.controls
+        recorder: TakeRecorder | None = None
+        changes = tracker.changes
+        end = _End(self.seconds, self.source)
+        for item in self.source:
+            if type(item) is not CoilFrame:
+                if not self._note(item, recorder):
+                    break
+            else:
+                if keeper is not None and keeper.recorder is not recorder:
+                    recorder = keeper.recorder
+                    if recorder is not None:
+                        tracker.restart()  # a take begins with a tracker that knows nothing, as its replay does
+                if tracker.changes != changes:
+                    changes = tracker.changes
+                    self._pass_on(recorder, item.arrival_ns)
+                before_ns = clock()
+                pose = step(item)
+                for sink in sinks:
+                    sink.send(pose)
+                sent_ns = clock()
+                if recorder is not None:
+                    recorder.put(item, tracker.coils, pose)
+                add(pose, before_ns, sent_ns)
+                if end.reached(item):
+                    break
+                tracker.settle()
+                if self.background is not None:
+                    self._follow_background()
+            while (control := controls.take()) is not None:
+                if not self._obey(control, recorder):
+                    return
+
+    def _pass_on(self, recorder: TakeRecorder | None, next_arrival_ns: int) -> None:
+        """The set-up has changed: whoever was told of it is told again, before the next frame."""
+        model, setup = self.tracker.model, self.tracker.setup
+        weights = setup.session.speaker_weights
+        if recorder is not None:
+            recorder.mark(f"{SESSION_MARK}: {session_toml(setup.session)}", next_arrival_ns - 1)
+        self.info = stream_info(model, setup, self.info.rate_hz)
+        for sink in self.sinks:
+            sink.change(self.info)
+        if weights is None:
+            self.said("the speaker is free again")
+        else:
+            shown = ", ".join(f"{weight:+.2f}" for weight in model.speaker.normalised(weights))
+            self.said(f"speaker: {setup.session.speaker_source}; in sigma {shown}")
+
+    def _note(self, note: SourceNote, recorder: TakeRecorder | None) -> bool:
+        """What happens between frames; False ends the run."""
+        status = self.status
+        status.tell(note)
+        if note.kind is NoteKind.COMMAND and self.handles is not None:
+            setup = self.handles(note, self.tracker)
+            if setup is None:
+                return False
+            if setup is not self.tracker.setup:
+                self.tracker.change(setup)
+        if note.kind in (NoteKind.SILENT, NoteKind.DISCONNECTED) and status.frames:
+            status.silent_s = (note.arrival_ns - status.last_arrival_ns) * 1e-9
+            self._show(self.tracker.idle(status.silent_s))
+        if note.kind is not NoteKind.SILENT:
+            if recorder is not None:
+                recorder.mark(f"{SOURCE_MARK}: {note.kind.value}: {note.text}", note.arrival_ns)
+            if note.kind not in (NoteKind.GAP, NoteKind.BAD_DATA):
+                self.said(note.text)
+        return True
+
+    def _show(self, pose: TrackedPose) -> None:
+        self.status.status = pose.status
+        for sink in self.sinks:
+            sink.send(pose)
+
+    def _follow_background(self) -> None:
+        background = self.background
+        assert background is not None
+        tracker = self.tracker
+        if tracker.pose.status == PoseStatus.OK:
+            background.add(tracker.used)
+        estimate = background.latest
+        if estimate is None or estimate is self._followed:
+            return
+        self._followed = estimate
+        enough = estimate.frames * background.spacing_s >= self.fix_after_s
+        tracker.fix_speaker(
+            estimate.weights,
+            f"joint estimate from {estimate.frames} frames of this run" + ("" if enough else ", not final"),
+        )
+        if enough:
+            background.close()
+            self.background = None
+
+    def _obey(self, control: Control, recorder: TakeRecorder | None) -> bool:
+        """What a user asked for; False ends the run."""
+        keeper = self.keeper
+        if control.kind == "quit":
+            return False
+        if control.kind == "mark":
+            if recorder is not None:
+                recorder.mark(control.text, control.time_ns)
+            self.said(
+                f"mark: {control.text}" + ("" if recorder is not None else " (no take is being recorded)")
+            )
+        elif control.kind in ("take_start", "take_stop"):
+            if keeper is None:
+                self.said("no take: say where takes go with --record")
+            elif control.kind == "take_start":
+                keeper.start(control.text)
+            else:
+                keeper.stop()
+        elif control.kind == "fix_speaker":
+            if self.tracker.setup.session.speaker_weights is None and not self.tracker.fix_average():
+                self.said("the speaker cannot be fixed yet: no frame was tracked")
+        elif control.kind == "free_speaker":
+            self.tracker.free_speaker()
+        return True
+
+
+class _End:
+    """Whether the source has delivered as many seconds, by its own clock, as were asked for."""
+
+    def __init__(self, seconds: float | None, source: FrameSource) -> None:
+        self._seconds = seconds
+        self._source = source
+        self._last_s = float("inf")
+        self._started = seconds is None
+
+    def reached(self, frame: CoilFrame) -> bool:
+        if not self._started:
+            assert self._seconds is not None
+            period_s = 1.0 / self._source.rate_hz if self._source.rate_hz else 0.0
+            self._last_s = frame.device_time_s + self._seconds - period_s - 1e-6
+            self._started = True
+        return frame.device_time_s >= self._last_s
 
 
 def stream_recording(
@@ -197,7 +253,7 @@ def stream_recording(
     destination: str,
     realtime: bool = True,
     seconds: float | None = None,
-    watch: Callable[[Source, LiveStatus], AbstractContextManager[object]] | None = None,
+    watch: Callable[[FrameSource, LiveStatus], AbstractContextManager[object]] | None = None,
 ) -> Summary:
     """Tracks a recording frame by frame and sends the poses over OSC, at its own pace or as fast as possible.
 
@@ -208,7 +264,7 @@ def stream_recording(
     tracker = Tracker(model, setup)
     source = ReplaySource(recording, speed=1.0 if realtime else None, loop=seconds is not None)
     sink = OscSink(destination)
-    status = LiveStatus(len(setup.roles), [sink])
+    status = LiveStatus(setup.roles, [sink])
     try:
         with watch(source, status) if watch else nullcontext():
             return run_live(
@@ -236,52 +292,8 @@ def sleeping_collector() -> Iterator[None]:
             gc.enable()
 
 
-def _loop(
-    source: Source, tracker: Tracker, sinks: tuple[Sink, ...], status: LiveStatus, seconds: float
-) -> None:
-    clock, step, add = time.perf_counter_ns, tracker.step, status.add
-    last_s: float | None = None  # device time from which no further frame is wanted
-    for frame in source:
-        before_ns = clock()
-        pose = step(frame)
-        for sink in sinks:
-            sink.send(pose)
-        add(pose, before_ns, clock())
-        if last_s is None:
-            last_s = frame.device_time_s + seconds - 1.0 / source.rate_hz - 1e-6
-        if frame.device_time_s >= last_s:
-            break
-
-
-def _summary(source: Source, info: StreamInfo, status: LiveStatus) -> Summary:
-    frames = status.frames
-    duration_s = (status.last_arrival_ns - status.first_arrival_ns) * 1e-9
-    late: Percentiles | None = None
+def _lateness(source: FrameSource) -> Sequence[int] | None:
     if isinstance(source, ReplaySource) and source.speed is not None:
-        histogram = latency_histogram()
-        for lateness_ns in source.lateness_ns[source.lateness_ns >= 0].tolist():
-            histogram.add(lateness_ns)
-        late = histogram.as_dict(NS_PER_MS)
-    return Summary(
-        model=info.model_name,
-        frames=frames,
-        duration_s=duration_s,
-        stream_s=status.last_device_s - status.first_device_s,
-        rate_hz=(frames - 1) / duration_s if frames > 1 and duration_s > 0 else None,
-        nominal_rate_hz=info.rate_hz,
-        speaker_fixed=info.speaker_fixed,
-        solve_us=status.solve_ns.as_dict(NS_PER_US),
-        arrival_to_sent_ms=status.arrival_to_sent_ns.as_dict(NS_PER_MS),
-        lateness_ms=late,
-        residual_mm={"mean": status.residuals.mean, "median": status.residuals.percentile(50.0)},
-        status_shares={
-            state.name.lower(): status.statuses[state] / frames if frames else 0.0 for state in PoseStatus
-        },
-        coils={
-            role: 1.0 - int(missing) / frames if frames else 0.0
-            for role, missing in zip(info.roles, status.coils_missing, strict=True)
-        },
-        gaps=status.gaps,
-        missing_frames=status.missing_frames,
-        sinks=tuple(SinkSummary(sink.destination, sink.sent, sink.dropped) for sink in status.sinks),
-    )
+        late: list[int] = source.lateness_ns[source.lateness_ns >= 0].tolist()
+        return late
+    return None

@@ -65,6 +65,10 @@ class FreeSpeakerSolver:
             return PoseStatus.LOST
         return self._status
 
+    def distances(self, coils: FloatArray, distances_mm: FloatArray) -> None:
+        """Fills distances_mm (n,) for any coils (n, 3), whether they were solved for or not."""
+        kernels.free_residuals(coils, self._base, self._core, self.weights, distances_mm)
+
     def solve_all(self, coils: FloatArray) -> SolvedFrames:
         """A whole take of coils (frames, n, 3) from a fresh start, in one compiled loop."""
         self.reset()
@@ -124,6 +128,15 @@ class FixedSpeakerSolver:
         elif not self._started:
             return PoseStatus.LOST
         return status
+
+    def continue_from(self, pose_weights: FloatArray) -> None:
+        """The next frame follows this pose (K,), which another solver found."""
+        self.weights[:] = pose_weights
+        self._started = True
+
+    def distances(self, coils: FloatArray, distances_mm: FloatArray) -> None:
+        """Fills distances_mm (n,) for any coils (n, 3), whether they were solved for or not."""
+        kernels.coil_residuals(coils, self._base, self._directions, self.weights, distances_mm)
 
     def solve_all(self, coils: FloatArray) -> SolvedFrames:
         """A whole take of coils (frames, n, 3) from a fresh start, in one compiled loop."""

@@ -1,16 +1,15 @@
-"""The paper's two experiments over a whole recording, and the same tracker one frame at a time."""
+"""The paper's two experiments over a whole recording."""
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .. import InputError
-from ..drivers.frames import CoilFrame, Recording
+from ..drivers.frames import Recording
 from ..model.multilinear import SpeakerModel, TongueModel
-from .pose import FloatArray, PoseStatus, TrackedPose, TrackedPoses
+from .pose import FloatArray, PoseStatus, TrackedPoses
 from .session import Session
 from .setup import Setup, complete_setup
 from .solver import FixedSpeakerSolver, FreeSpeakerSolver, SolvedFrames
@@ -126,63 +125,3 @@ def fixed_speaker_energy(model: TongueModel, setup: Setup) -> float:
     if weights is None:
         return 0.0
     return setup.session.energy.beta_speaker * float(np.sum((weights - model.speaker.mean) ** 2))
-
-
-class Tracker:
-    """Frame in, pose out: prepares and solves one frame in compiled code, allocating nothing.
-
-    It owns one `TrackedPose` and writes over it at every step. With `setup.session.speaker_weights` the
-    speaker is fixed and only the pose is solved; without, both are.
-    """
-
-    def __init__(self, model: TongueModel, setup: Setup) -> None:
-        self._preparation = setup.preparation
-        weights = setup.session.speaker_weights
-        at_coils = model.at(setup.vertices)
-        self._solver: FixedSpeakerSolver | FreeSpeakerSolver
-        if weights is None:
-            self.speaker: SpeakerModel | None = None
-            self._solver = FreeSpeakerSolver(at_coils, setup.session.energy)
-        else:
-            self.speaker = model.for_speaker(weights)
-            self._solver = FixedSpeakerSolver(self.speaker.at(setup.vertices), setup.session.energy)
-        self._constant_energy = fixed_speaker_energy(model, setup)
-        self._mean = model.pose.mean
-        self._sigma = model.pose.sigma
-        self.pose = TrackedPose(
-            weights=self._solver.pose_weights,
-            normalised=model.pose.normalised(self._solver.pose_weights),
-            speaker_weights=self._solver.speaker_weights,
-            residuals_mm=self._solver.residuals_mm,
-        )
-
-    @property
-    def coils(self) -> FloatArray:
-        """(n, 3) the last frame's prepared coils, mm in the model frame, NaN = missing."""
-        return self._preparation.coils
-
-    def warm_up(self) -> None:
-        """Compiles or loads the kernels on a frame without coils, so that the first real one is not late."""
-        self._solver.solve(np.full_like(self._preparation.coils, np.nan))
-        self._preparation.frame(np.full((self._preparation.channels_needed, 3), np.nan))
-        self.reset()
-
-    def reset(self) -> None:
-        """Forgets the previous frame, as after a jump in time."""
-        self._solver.reset()
-
-    def step(self, frame: CoilFrame) -> TrackedPose:
-        """Tracks one frame of the source's raw positions (coils, 3), mm."""
-        pose = self.pose
-        coils = self._preparation.frame(frame.positions)
-        pose.status = self._solver.solve(coils)
-        np.subtract(pose.weights, self._mean, out=pose.normalised)
-        np.divide(pose.normalised, self._sigma, out=pose.normalised)
-        pose.energy, pose.residual_mm = self._solver.result
-        pose.energy += self._constant_energy
-        pose.valid_coils = len(coils) - int(np.count_nonzero(np.isnan(coils[:, 0])))
-        pose.device_time_s = frame.device_time_s
-        pose.frame_number = frame.frame_number
-        pose.arrival_ns = frame.arrival_ns
-        pose.solved_ns = time.perf_counter_ns()
-        return pose

@@ -44,9 +44,9 @@ def run_demo(args: argparse.Namespace) -> int:
     """Stream the bundled recording and print the summary."""
     from ..bundled import bundled_model, bundled_recording
     from ..live import stream_recording
+    from ..online import Tracker
     from ..setup import complete_setup
     from ..streams.osc import resolve
-    from ..tracking import Tracker
     from .watching import announced_compilation, watched
 
     resolve(args.osc)

@@ -13,8 +13,9 @@ from types import FrameType
 
 from ..kernelcache import cache_lasts
 from ..latency import NS_PER_MS, NS_PER_US, LogHistogram
-from ..live import LiveStatus, Source
+from ..live import FrameSource
 from ..pose import PoseStatus
+from ..status import LiveStatus
 
 TERMINAL_PERIOD_S = 0.2
 PLAIN_PERIOD_S = 5.0
@@ -54,24 +55,24 @@ def announced_compilation() -> Iterator[None]:
 
 
 @contextmanager
-def watched(source: Source, status: LiveStatus) -> Iterator[None]:
+def watched(source: FrameSource, status: LiveStatus) -> Iterator[None]:
     """A status line on stderr and a clean end at Ctrl-C, for as long as a run lasts."""
-    with closed_by_interrupt(source), status_line(status):
+    with stopped_by_interrupt(source), status_line(status):
         yield
 
 
 @contextmanager
-def closed_by_interrupt(source: Source) -> Iterator[None]:
-    """The first Ctrl-C closes the source, so that the run ends as at its last frame; a second one interrupts."""
+def stopped_by_interrupt(source: FrameSource) -> Iterator[None]:
+    """The first Ctrl-C stops the source, so that the run ends as at its last frame; a second one interrupts."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
-    def close(number: int, frame: FrameType | None) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, before)
-        source.close()
+        source.stop()
 
-    before = signal.signal(signal.SIGINT, close)
+    before = signal.signal(signal.SIGINT, stop)
     try:
         yield
     finally:
