@@ -100,6 +100,7 @@ ERRORS = {
     0x2C: "the port handle is empty: its tool was unplugged",
 }
 """What ERRORxx means."""
+UNKNOWN_COMMAND, BAD_CRC, WRONG_PARAMETER, WRONG_HANDLE, WRONG_MODE = 0x01, 0x04, 0x07, 0x08, 0x0C
 
 
 class NdiError(ValueError):
@@ -656,8 +657,8 @@ class ReplyReader:
 
     @property
     def pending(self) -> bool:
-        """Whether bytes have come that are not part of a reply or damage already told."""
-        return bool(self._buffer) or self._bad > 0
+        """Whether bytes have come that `next` has not given out yet."""
+        return bool(self._buffer or self._ready) or self._bad > 0
 
     def clear(self) -> int:
         """Forgets everything that has come; returns how many bytes that was."""
