@@ -25,6 +25,7 @@ class Row:
     def __init__(self, info: TakeInfo) -> None:
         dtype = slot_dtype(info.row_dtype())
         self.slot = np.zeros(dtype.itemsize // 8, np.int64)
+        self._memory = memoryview(self.slot).cast("B")
         self._content = self.slot[:-1]
         self._check = self.slot[-1:].reshape(())
         numbers = self.slot.view(np.float64)
@@ -53,8 +54,8 @@ class Row:
 
         What the device should have and this frame has not becomes NaN.
         """
-        slot = self.slot
-        _RAW_HEAD.pack_into(slot, 0, frame.arrival_ns, frame.device_time_s, frame.frame_number)
+        memory = self._memory
+        _RAW_HEAD.pack_into(memory, 0, frame.arrival_ns, frame.device_time_s, frame.frame_number)
         self._positions[...] = frame.positions
         if self._quaternions is not None:
             self._quaternions[...] = np.nan if frame.quaternions is None else frame.quaternions
@@ -64,7 +65,7 @@ class Row:
             self._status[...] = np.nan if frame.status is None else frame.status
         self._prepared[...] = coils
         _POSE_HEAD.pack_into(
-            slot,
+            memory,
             self._pose_at,
             pose.status,
             pose.speaker_fixed,
@@ -77,5 +78,5 @@ class Row:
         self._speaker[...] = pose.speaker_weights
         self._residuals[...] = pose.residuals_mm
         self._states[...] = pose.coil_states
-        slot[-2] = sequence
-        np.add.reduce(self._content, 0, None, self._check)  # the same as `journal.check_of`
+        self.slot[-2] = sequence
+        np.add.reduce(self._content, out=self._check)  # the same as `journal.check_of`
