@@ -285,6 +285,11 @@ class XdfFile:
         more = f"; and {len(self.damages) - 3} more" if len(self.damages) > 3 else ""
         return "; ".join(self.damages[:3]) + more
 
+    @property
+    def only_cut_off(self) -> bool:
+        """Whether the file is whole up to where it ends, so that sample i of a stream is the i-th that was written."""
+        return len(self.spans) == 1 and len(self.damages) <= (1 if self.whole_bytes < self.size else 0)
+
     def named(self, name: str) -> XdfStream | None:
         """The first stream of a name."""
         return next((stream for stream in self.streams if stream.name == name), None)

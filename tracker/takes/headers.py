@@ -27,7 +27,7 @@ def header_bytes(info: TakeInfo) -> bytes:
 
 def info_from_streams(streams: Sequence[XdfStream]) -> TakeInfo:
     """What `header_bytes` wrote. Raises InputError, without the file's name, for anything else."""
-    by_name = {stream.name: stream for stream in streams}
+    by_name = {stream.name: stream for stream in reversed(streams)}  # of two with one name the first
     raw = by_name.get(RAW)
     if raw is None or TAKE_MARK not in raw.description:
         raise InputError(
