@@ -21,6 +21,7 @@ from ..devices.ndi import (
     OUT_OF_VOLUME_TOO,
     REPLY_OPTIONS,
     RESET_REPLY,
+    TRANSFORMS,
     NdiDamaged,
     NdiError,
     PortHandle,
@@ -458,13 +459,12 @@ class NdiDevice:
 
     def _gx(self, arguments: str) -> str:
         """The transforms of the first three handles, and their status, last one first, after the system's."""
-        _expect(arguments, "", "0001", "0801", "8001")
-        options = OUT_OF_VOLUME_TOO if arguments == "0801" else 0
-        tools = self._measurement(options | 0x0001).tools[:3]
+        _expect(arguments, "", "0001")
+        tools = self._measurement(TRANSFORMS).tools[:3]
         text = ""
         for tool in tools:
             # The same fields as TX has, without handle, status and frame.
-            line = encode_tx(TrackingReply((tool,)), 0x0001).partition("\n")[0][4:]
+            line = encode_tx(TrackingReply((tool,)), TRANSFORMS).partition("\n")[0][4:]
             text += (line[:-16] if tool.state in (State.VALID, State.MISSING) else line) + "\n"
         text += "DISABLED\n" * (3 - len(tools))
         statuses = [tool.port_status & 0xFF for tool in tools] + [0] * (3 - len(tools))
