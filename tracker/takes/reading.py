@@ -24,6 +24,7 @@ from .layout import MARKER_WORDS, MARKERS, POSE, POSE_HEAD, PREPARED, RAW, SESSI
 
 NUMBERS = (RAW, PREPARED, POSE)
 NS = 1e-9
+LARGEST_STAMP_S = 1e10
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,10 @@ class Marker:
 
 @dataclass(frozen=True)
 class _Index:
-    """Which frame each row of a stream is. rows: (rows,) of the frames, None = they are the frames."""
+    """Which frame each row of a stream is.
+
+    rows: (rows,) indices of frames, their number for a row that belongs to none; None = the rows are the frames.
+    """
 
     stamps: FloatArray
     rows: Mapping[str, NDArray[np.int64] | None]
@@ -255,14 +259,16 @@ class Take:
     def _index(self) -> _Index:
         stamps = {name: self.stream_stamps(name) for name in NUMBERS}
         longest = max(stamps.values(), key=len)
-        if all(np.array_equal(values, longest) for values in stamps.values()):
+        if _possible(longest).all() and all(np.array_equal(values, longest) for values in stamps.values()):
             return _Index(longest, dict.fromkeys(NUMBERS))
         keys = {name: _keys(values) for name, values in stamps.items()}
         together, first = np.unique(np.concatenate(list(keys.values())), return_index=True)
         whole = np.concatenate(list(stamps.values()))[first]
-        finite = np.isfinite(together)
-        together, whole = together[finite], whole[finite]
+        possible = _possible(together)
+        together, whole = together[possible], whole[possible]
         rows = {name: np.searchsorted(together, values) for name, values in keys.items()}
+        for name, values in keys.items():
+            rows[name][~_possible(values)] = len(whole)
         return _Index(whole, rows)
 
     def stream_stamps(self, name: str) -> FloatArray:
@@ -283,7 +289,7 @@ class Take:
         if rows is None:
             return values
         out = np.full((self.frame_count, len(columns)), np.nan)
-        known = rows < self.frame_count  # a stamp that is no number belongs to no frame
+        known = rows < self.frame_count
         out[rows[known]] = values[known]
         return out
 
@@ -311,7 +317,7 @@ def read_take(path: str | os.PathLike[str]) -> Take:
     if not beside.exists():
         return Take(path, info, file, None, "")
     try:
-        journal = read_journal(beside, bytes(memoryview(data)[: file.headers_end]))
+        journal = read_journal(beside, path)
     except InputError as reason:
         return Take(path, info, file, None, f"The journal beside the take was not used: {reason}")
     if journal.dtype != info.row_dtype():
@@ -326,6 +332,11 @@ def read_take(path: str | os.PathLike[str]) -> Take:
 
 def stream_count(stream: XdfStream | None) -> int:
     return 0 if stream is None else stream.count
+
+
+def _possible(stamps: FloatArray) -> NDArray[np.bool_]:
+    """(rows,) whether it can be a time; damage makes any number of it."""
+    return np.asarray(np.abs(stamps) < LARGEST_STAMP_S)
 
 
 def _keys(stamps: FloatArray) -> FloatArray:

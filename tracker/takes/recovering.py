@@ -54,8 +54,10 @@ def _pieces(take: Take, data: Buffer) -> Iterator[bytes | memoryview]:
     yield boundary()
     for name in NUMBERS:
         more = take.from_journal(name)
-        for begin in range(0, 0 if more is None else len(more), ROWS_A_CHUNK):
-            rows = more[begin : begin + ROWS_A_CHUNK]  # type: ignore[index]
+        if more is None:
+            continue
+        for begin in range(0, len(more), ROWS_A_CHUNK):
+            rows = more[begin : begin + ROWS_A_CHUNK]
             yield samples(_stream_id(take, name), rows["arrival_ns"] * NS, rows[name])
     for name in (*NUMBERS, MARKERS):
         stamps = take.stream_stamps(name)
@@ -85,10 +87,12 @@ def _sentences(take: Take, recovered: Take) -> tuple[str, ...]:
     file = take.file
     lost = file.size - sum(end - begin for begin, end in file.spans) - len(MAGIC)
     found = [
-        f"{recovered.frame_count} frames, {recovered.duration_s:.3f} s, and {len(recovered.markers)} marks are there."
+        f"{recovered.frame_count} frames, {recovered.duration_s:.3f} s, {len(recovered.markers)} mark(s)."
     ]
     if take.damage:
         found.append(f"Found in the old file: {take.damage}.")
+    else:
+        found.append("The old file is whole as far as it goes, but was never ended.")
     if lost:
         found.append(f"{lost} bytes that belong to no whole chunk were left out.")
     if take.journal_note:
