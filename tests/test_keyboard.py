@@ -121,11 +121,9 @@ import fcntl, signal, termios, threading, time
 from tonguetrack.tracker.control import ControlQueue
 from tonguetrack.tracker.keyboard import watched_keys
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-gone = threading.Event()
-signal.signal(signal.SIGHUP, lambda *_: gone.set())
+signal.signal(signal.SIGHUP, signal.SIG_IGN)
 with watched_keys(ControlQueue()):
     print("watched", flush=True)
-    gone.wait(20)
     end = time.monotonic() + 20
     while threading.active_count() > 1 and time.monotonic() < end:
         time.sleep(0.01)
