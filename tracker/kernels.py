@@ -221,7 +221,7 @@ def coil_residuals(coils, base, directions, weights, residuals):
 @njit(**OPTIONS)
 def free_residuals(coils, base, core, weights, residuals):
     """`coil_residuals` for the multilinear model; weights (m + n,) = speaker weights, then pose weights."""
-    speakers, poses, rows = core.shape
+    speakers, poses, _ = core.shape
     for i in range(coils.shape[0]):
         if np.isnan(coils[i, 0]):
             residuals[i] = np.nan

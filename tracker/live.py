@@ -78,7 +78,7 @@ def run_live(
 class LiveRun:
     """A run with everything that a user may do to it while it lasts.
 
-    Sinks and keeper belong to the caller, who closes them. background: estimates the speaker beside the
+    The sinks belong to the caller, who closes them; a take ends with the run. background: estimates the speaker beside the
     loop until `fix_after_s` of speech were tracked. said: called with what a person should read, from the
     loop's thread, at rare events only. handles: a command of a client that drives the source; gives the set-up
     to go on with, or None to end the run.
@@ -97,14 +97,19 @@ class LiveRun:
     said: Callable[[str], None] = lambda text: None
     handles: Callable[[SourceNote, Tracker], Setup | None] | None = None
     _followed: object = None  # the estimate that the tracker goes by already
+    _listened_s: float = 0.0  # tracked speech that the background was given
 
     def run(self) -> Summary:
         """As `run_live`."""
         self.tracker.warm_up()
         for sink in self.sinks:
             sink.start(self.info)
-        with sleeping_collector():
-            self._loop()
+        try:
+            with sleeping_collector():
+                self._loop()
+        finally:
+            if self.keeper is not None:
+                self.keeper.close()
         takes = self.keeper.finished if self.keeper is not None else ()
         return summarise(self.info, self.status, _lateness(self.source), takes)
 
@@ -119,10 +124,11 @@ class LiveRun:
                 if not self._note(item, recorder):
                     break
             else:
-                if keeper is not None and keeper.recorder is not recorder:
-                    recorder = keeper.recorder
-                    if recorder is not None:
-                        tracker.restart()  # a take begins with a tracker that knows nothing, as its replay does
+                if keeper is not None:
+                    if status.frames == 0:
+                        keeper.first_frame(item)
+                    if keeper.recorder is not recorder:
+                        recorder = self._take(keeper.recorder)
                 if tracker.changes != changes:
                     changes = tracker.changes
                     self._pass_on(recorder, item.arrival_ns)
@@ -133,15 +139,34 @@ class LiveRun:
                 sent_ns = clock()
                 if recorder is not None:
                     recorder.put(item, tracker.coils, pose)
+                    status.take_frames = recorder.frames
+                    if recorder.failure is not None and not status.take_failure:
+                        status.take_failure = recorder.failure
+                        self.said(f"NOT RECORDING: {recorder.failure}")
                 add(pose, before_ns, sent_ns)
                 if end.reached(item):
                     break
                 tracker.settle()
                 if self.background is not None:
-                    self._follow_background()
+                    self._follow(self.background)
             while (control := controls.take()) is not None:
                 if not self._obey(control, recorder):
                     return
+            if keeper is not None and keeper.refusal:
+                self.said(keeper.refusal)
+                keeper.refusal = ""
+
+    def _take(self, recorder: TakeRecorder | None) -> TakeRecorder | None:
+        """A take begins or has ended. It begins with a tracker that knows nothing, as its replay will."""
+        status = self.status
+        status.take_failure, status.take_frames = "", 0
+        status.take_path = "" if recorder is None else str(recorder.path)
+        if recorder is None:
+            self.said("the take has ended")
+        else:
+            self.tracker.restart()
+            self.said(f"recording {recorder.path}")
+        return recorder
 
     def _pass_on(self, recorder: TakeRecorder | None, next_arrival_ns: int) -> None:
         """The set-up has changed: whoever was told of it is told again, before the next frame."""
@@ -183,23 +208,20 @@ class LiveRun:
         for sink in self.sinks:
             sink.send(pose)
 
-    def _follow_background(self) -> None:
-        background = self.background
-        assert background is not None
+    def _follow(self, background: BackgroundSpeaker) -> None:
+        """Gives the background this frame, and goes by its newest estimate; the one after `fix_after_s` is the last."""
         tracker = self.tracker
         if tracker.pose.status == PoseStatus.OK:
             background.add(tracker.used)
+            self._listened_s += tracker.period_s
         estimate = background.latest
         if estimate is None or estimate is self._followed:
             return
         self._followed = estimate
-        enough = estimate.frames * background.spacing_s >= self.fix_after_s
-        tracker.fix_speaker(
-            estimate.weights,
-            f"joint estimate from {estimate.frames} frames of this run" + ("" if enough else ", not final"),
-        )
-        if enough:
-            background.close()
+        final = self._listened_s >= self.fix_after_s
+        source = f"joint estimate from {estimate.frames} frames of this run"
+        tracker.fix_speaker(estimate.weights, source if final else f"{source}, not final")
+        if final:
             self.background = None
 
     def _obey(self, control: Control, recorder: TakeRecorder | None) -> bool:

@@ -43,7 +43,7 @@ class Tracker:
     the last one: the poses are those of `track_recording`, bit for bit.
     rate_hz: nominal, 0.0 = unknown. fix_after_s: with a free speaker, so much tracked speech is averaged and
     the speaker then fixed (paper, section "Experiments"); None = never by itself.
-    changes: grows with every change of the set-up, for those who have to pass it on.
+    period_s: the nominal time between frames. changes: grows with every change of the set-up, for those who have to pass it on.
     """
 
     def __init__(
@@ -56,8 +56,8 @@ class Tracker:
     ) -> None:
         self.model = model
         self._watchful = watchful
-        self._period_s = 1.0 / rate_hz if rate_hz > 0 else DEFAULT_PERIOD_S
-        self._reset_s = max(RESET_S, RESET_PERIODS * self._period_s)
+        self.period_s = 1.0 / rate_hz if rate_hz > 0 else DEFAULT_PERIOD_S
+        self._reset_s = max(RESET_S, RESET_PERIODS * self.period_s)
         self._fix_after_s = fix_after_s
         self.changes = -1
         self._mean, self._sigma = model.pose.mean, model.pose.sigma
@@ -139,12 +139,16 @@ class Tracker:
     def step(self, frame: CoilFrame) -> TrackedPose:
         """Tracks one frame of the source's raw positions (coils, 3), mm."""
         pose, solver = self.pose, self._solver
+        step_s = self.period_s
         if self._watchful:
-            status = self._watch(frame)
+            step_s = self._advance(frame.device_time_s)
+            status = self._watch(frame, step_s)
         else:
             coils = self._preparation.frame(frame.positions)
             status = solver.solve(coils)
             np.isnan(coils[:, 0], out=self._guard.states, casting="unsafe")  # MISSING = 1, TRUSTED = 0
+        if self._averages and status == PoseStatus.OK:
+            self._average(solver.speaker_weights, step_s)
         pose.status = status
         np.subtract(pose.weights, self._mean, out=pose.normalised)
         np.divide(pose.normalised, self._sigma, out=pose.normalised)
@@ -157,10 +161,9 @@ class Tracker:
         pose.solved_ns = time.perf_counter_ns()
         return pose
 
-    def _watch(self, frame: CoilFrame) -> int:
+    def _watch(self, frame: CoilFrame, step_s: float) -> int:
         """Solves with the coils that can be trusted; the status."""
         solver, guard = self._solver, self._guard
-        step_s = self._advance(frame.device_time_s)
         coils = self._preparation.frame(frame.positions)
         status = solver.solve(guard.admit(coils, self._time_s))
         residuals = solver.residuals_mm
@@ -171,8 +174,6 @@ class Tracker:
         if status == PoseStatus.OK:
             guard.learn(residuals, self._time_s, step_s)
             self._without_s = 0.0
-            if self._averages:
-                self._average(solver.speaker_weights, step_s)
         elif status == PoseStatus.HELD:
             self._without_s += step_s
             if self._without_s > HOLD_S:
@@ -209,7 +210,7 @@ class Tracker:
             self._guard.resume()
             self._without_s = 0.0
         if not 0.0 < step_s <= self._reset_s:
-            step_s = self._period_s  # also where the device has no clock
+            step_s = self.period_s  # also where the device has no clock
         self._time_s += step_s
         return step_s
 

@@ -9,9 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..drivers.frames import NoteKind, SourceNote
-from .latency import NS_PER_MS, NS_PER_US, latency_histogram, percentiles_text, residual_histogram
+from .latency import (
+    NS_PER_MS,
+    NS_PER_US,
+    LogHistogram,
+    latency_histogram,
+    percentiles_text,
+    residual_histogram,
+)
 from .pose import CoilState, PoseStatus, TrackedPose
-from .streams.sink import Sink, StreamInfo
+from .streams.sink import LiveNumbers, Sink, StreamInfo
 
 if TYPE_CHECKING:
     from .takes.keeper import KeptTake
@@ -138,6 +145,23 @@ class LiveStatus:
     @property
     def dropped(self) -> int:
         return sum(sink.dropped for sink in self.sinks)
+
+    @property
+    def numbers(self) -> LiveNumbers:
+        """What the receivers of a stream are told once a second."""
+
+        def pair(histogram: LogHistogram) -> tuple[float | None, float | None]:
+            values = (histogram.percentile(50.0), histogram.percentile(99.0))
+            return tuple(None if value is None else value / NS_PER_MS for value in values)  # type: ignore[return-value]
+
+        return LiveNumbers(
+            pair(self.device_to_host_ns),
+            pair(self.host_to_solved_ns),
+            pair(self.solved_to_sent_ns),
+            self.take_path,
+            self.take_frames,
+            self.take_failure,
+        )
 
     @property
     def troubles(self) -> list[str]:

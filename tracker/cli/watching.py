@@ -57,26 +57,34 @@ def announced_compilation() -> Iterator[None]:
 @contextmanager
 def watched(source: FrameSource, status: LiveStatus) -> Iterator[None]:
     """A status line on stderr and a clean end at Ctrl-C, for as long as a run lasts."""
-    with stopped_by_interrupt(source), status_line(status):
+    with stopped_by_signals(source), status_line(status):
         yield
 
 
 @contextmanager
-def stopped_by_interrupt(source: FrameSource) -> Iterator[None]:
-    """The first Ctrl-C stops the source, so that the run ends as at its last frame; a second one interrupts."""
+def stopped_by_signals(source: FrameSource) -> Iterator[None]:
+    """The first Ctrl-C, or a request to terminate, stops the source, so that the run ends as at its last frame;
+    a second one interrupts."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
     def stop(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGINT, before)
+        restore()
         source.stop()
 
-    before = signal.signal(signal.SIGINT, stop)
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    for number in before:
+        signal.signal(number, stop)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        restore()
 
 
 @contextmanager
@@ -111,21 +119,36 @@ def _show(status: LiveStatus, over: threading.Event) -> None:
             else:
                 _say(line)
         if terminal:
-            sys.stderr.write("\r" + " " * (shutil.get_terminal_size().columns - 1) + "\r")
+            sys.stderr.write(_blank_line())
             sys.stderr.flush()
     except (OSError, ValueError):  # nobody reads stderr any more
         return
 
 
 def status_text(status: LiveStatus, rate_hz: float) -> str:
-    """One line as `LEGEND` says, short enough for a terminal of 80 columns."""
+    """One line as `LEGEND` says, short enough for a terminal of 80 columns; what is wrong comes first."""
     state = PoseStatus(status.status).name.lower()
     residual = f"{status.residual_mm:.2f}" if status.valid_coils else "-"
+    troubles = status.troubles
+    wrong = f"[{', '.join(troubles)}] " if troubles else ""
     return (
-        f"{rate_hz:.0f} Hz {state}  solve {_pair(status.solve_ns, NS_PER_US, 0)} us  "
+        f"{wrong}{rate_hz:.0f} Hz {state}  solve {_pair(status.solve_ns, NS_PER_US, 0)} us  "
         f"sent {_pair(status.arrival_to_sent_ns, NS_PER_MS, 2)} ms  {residual} mm  "
-        f"{status.valid_coils}/{len(status.coils_missing)} coils  {status.dropped} dropped"
+        f"{status.valid_coils}/{len(status.coils_missing)} coils  {status.dropped} dropped{_take_text(status)}"
     )
+
+
+def _take_text(status: LiveStatus) -> str:
+    return f"  rec {status.take_frames}" if status.take_path else ""
+
+
+def say_above(text: str) -> None:
+    """A line for a person, in the place of the status line, which comes again below it."""
+    _say((_blank_line() if sys.stderr.isatty() else "") + text)
+
+
+def _blank_line() -> str:
+    return "\r" + " " * (shutil.get_terminal_size().columns - 1) + "\r"
 
 
 def _pair(histogram: LogHistogram, unit: float, digits: int) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ... import InputError
+from ...drivers.frames import CoilFrame
 from .layout import TakeInfo
 from .recorder import TakeRecorder
 
@@ -30,26 +31,40 @@ class TakeKeeper:
 
     place: a file `take.xdf`: the first take; further ones are take-2.xdf, take-3.xdf, ... A folder: take-001.xdf,
     take-002.xdf, ...; names that are asked for are used as they are. No file is ever overwritten.
-    describe: what the take's header says, asked at the moment a take begins.
+    describe: what a take's header says, from one of the source's frames; asked when a take begins.
 
-    `recorder` is what the loop reads at every frame: None between takes.
+    `recorder` is what the loop reads at every frame: None between takes. Raises InputError where the first
+    take's file exists already.
     """
 
-    def __init__(self, place: str | Path, describe: Callable[[], TakeInfo]) -> None:
+    def __init__(self, place: str | Path, describe: Callable[[CoilFrame], TakeInfo]) -> None:
         self.recorder: TakeRecorder | None = None
         self.finished: list[KeptTake] = []
         self.refusal = ""
         self._place = Path(place)
+        if not is_folder(self._place) and self._place.exists():
+            raise InputError(
+                f"{place}: this take exists already; choose another name, takes are never overwritten."
+            )
         self._describe = describe
+        self._frame: CoilFrame | None = None
         self._busy = threading.Lock()
         self._threads: list[threading.Thread] = []
+
+    def first_frame(self, frame: CoilFrame) -> None:
+        """Called with the run's first frame: its kind is that of all others. Begins the take that a file was named for."""
+        self._frame = frame
+        if not is_folder(self._place):
+            self.start_now()
 
     def start_now(self, name: str = "") -> None:
         """Begins a take; returns when its file exists. Raises InputError where it cannot."""
         with self._busy:
             if self.recorder is not None:
                 raise InputError(f"{self.recorder.path} is being recorded already; stop it first.")
-            recorder = TakeRecorder(self._describe(), self._next_path(name))
+            if self._frame is None:
+                raise InputError("no take can begin before the source's first frame.")
+            recorder = TakeRecorder(self._describe(self._frame), self._next_path(name))
             recorder.open()
             self.recorder = recorder
 

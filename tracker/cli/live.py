@@ -1,0 +1,239 @@
+"""`tonguetrack live`: a device in, poses out, takes on the disk."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+from .demo import positive_seconds
+from .names import BUNDLED
+
+if TYPE_CHECKING:
+    from ...drivers.sources import Source
+    from ...model.multilinear import TongueModel
+    from ..control import ControlQueue
+    from ..live import LiveRun
+    from ..online import Tracker
+    from ..session import Session
+    from ..status import LiveStatus, Summary
+    from ..streams.sink import Sink
+
+DEFAULT_OSC = "127.0.0.1:9000"
+LISTEN_S = 3.0
+"""So long a device is listened to where the session leaves coils or vertices open."""
+FIX_AFTER_S = 5.0
+
+
+def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Register `live`."""
+    live = subparsers.add_parser(
+        "live",
+        help="track a device, or anything that stands in for one",
+        description="Tracks a live source and streams the poses over OSC; records takes where asked. "
+        "Ctrl-C stops the device and ends with a summary. `tonguetrack devices` lists the kinds of sources.",
+    )
+    live.add_argument(
+        "source", metavar="SOURCE", help="rtc3d://HOST, ndi:///dev/ttyUSB0, replay:FILE, simulate:, ..."
+    )
+    live.add_argument("--session", metavar="FILE", help="the speaker's session file (TOML)")
+    live.add_argument(
+        "--model", default=BUNDLED, help="the tongue model (default: the bundled synthetic one)"
+    )
+    live.add_argument(
+        "--coils", metavar="CHANNEL=ROLE,...", help="which channel is which coil, where names do not tell"
+    )
+    live.add_argument("--osc", metavar="HOST:PORT", action="append",
+                      help=f"where to send; may be given several times (default {DEFAULT_OSC})")  # fmt: skip
+    live.add_argument("--record", metavar="TAKE.xdf",
+                      help="record from the start; a folder instead: takes begin when asked for (key t, or OSC)")  # fmt: skip
+    live.add_argument(
+        "--seconds", type=positive_seconds, metavar="N", help="stop after N seconds of the device's time"
+    )
+    live.add_argument("--fix-speaker-after", type=positive_seconds, metavar="N", default=FIX_AFTER_S,
+                      help="with no speaker in the session: fix it after N seconds of tracked speech (default %(default)g)")  # fmt: skip
+    live.add_argument("--speaker", choices=("mean", "joint"), default="mean",
+                      help="how it is estimated: the mean of free solves as in the paper, or one for all frames, "
+                      "estimated in the background (default mean)")  # fmt: skip
+    live.add_argument("--control", metavar="HOST:PORT",
+                      help="where control messages over OSC are taken (default 127.0.0.1:9001)")  # fmt: skip
+    live.add_argument("--save-session", metavar="FILE",
+                      help="at the end, write the session with everything that was estimated")  # fmt: skip
+    live.add_argument("--json", action="store_true", help="print the summary as JSON")
+    live.set_defaults(run=run_live_command)
+
+
+def run_live_command(args: argparse.Namespace) -> int:
+    """Set up, track until the end, print the summary. Exit code 1 where a take could not be recorded whole."""
+    from pathlib import Path
+
+    from ..sources import open_source
+    from ..streams.osc import resolve
+    from .names import keep_apart, named_model, prepare_folder
+    from .track import read_session
+    from .watching import stopped_by_signals
+
+    destinations = args.osc or [DEFAULT_OSC]
+    for destination in destinations:
+        resolve(destination)
+    model = named_model(args.model)
+    session = read_session(args)
+    for output in filter(None, (args.save_session, args.record)):
+        keep_apart([Path(output)], [Path(args.model)])
+        prepare_folder(Path(output))
+    say(f"model: {model.name} [{model.fingerprint}]")
+    say(f"opening {args.source}")
+    source = open_source(args.source)
+    try:
+        with stopped_by_signals(source):
+            summary = run_source(args, source, model, session, destinations)
+    finally:
+        source.close()
+    if summary is None:
+        say("stopped before anything was tracked.")
+        return 0
+    print(json.dumps(summary.as_dict(), indent=2, allow_nan=False) if args.json else summary)
+    return 1 if any(take.failure for take in summary.takes) else 0
+
+
+def run_source(
+    args: argparse.Namespace, source: Source, model: TongueModel, session: Session, destinations: list[str]
+) -> Summary | None:
+    """One run; where clients drive the source, one after the other until it is stopped."""
+    from ..gathering import recording_for_setup
+    from ..online import Tracker
+    from ..served import setup_for_points
+    from ..session import NO_SESSION
+    from ..setup import complete_setup
+
+    if hasattr(source, "wait_until_ready"):
+        stated = session if session.source != NO_SESSION else None
+        summary = None
+        say(f"{source.address}: waiting for a client to name its vertices")
+        while source.wait_until_ready():
+            setup = setup_for_points(model, source.coils, source.vertices, stated)
+            summary = run_once(args, source, Tracker(model, setup, source.rate_hz), destinations)
+        return summary
+    recording = recording_for_setup(source, session, LISTEN_S, lambda note: say(note.text))
+    setup = complete_setup(recording, model, session)
+    for decision in setup.decisions:
+        say(decision)
+    averaged = setup.session.speaker_weights is None and args.speaker == "mean"
+    fix_after_s = args.fix_speaker_after if averaged else None
+    rate_hz = source.rate_hz or recording.rate_hz
+    tracker = Tracker(model, setup, rate_hz, watchful=True, fix_after_s=fix_after_s)
+    return run_once(args, source, tracker, destinations)
+
+
+def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destinations: list[str]) -> Summary:
+    """Tracks with everything around it: sinks, takes, controls, the status line."""
+    from ..control import ControlQueue
+    from ..keyboard import KEYS, watched_keys
+    from ..live import LiveRun, stream_info
+    from ..served import obey_client
+    from ..status import LiveStatus
+    from ..takes.describing import take_info
+    from ..takes.keeper import TakeKeeper
+    from .watching import announced_compilation, say_above, status_line
+
+    with announced_compilation():
+        tracker.warm_up()
+    rate_hz = 1.0 / tracker.period_s
+    status = LiveStatus(tracker.setup.roles)
+    controls = ControlQueue()
+    with ExitStack() as stack:
+        status.sinks = tuple(open_sinks(source, destinations, status, stack))
+        keeper = None
+        if args.record:
+            keeper = TakeKeeper(
+                args.record, lambda frame: take_info(source, frame, tracker.model, tracker.setup, rate_hz)
+            )
+        serve_controls(args.control, controls, stack)
+        recording = lambda: keeper is not None and keeper.recorder is not None
+        if stack.enter_context(watched_keys(controls, recording)):
+            say(f"keys: {KEYS}; Ctrl-C ends")
+        run = LiveRun(
+            source,
+            tracker,
+            stream_info(tracker.model, tracker.setup, rate_hz),
+            status,
+            status.sinks,
+            keeper,
+            controls,
+            fix_after_s=args.fix_speaker_after,
+            seconds=args.seconds,
+            said=say_above,
+            handles=obey_client,
+        )
+        if args.speaker == "joint" and tracker.setup.session.speaker_weights is None:
+            estimate_beside(run, stack)
+        say(f"tracking {', '.join(tracker.setup.roles)} to {', '.join(s.destination for s in status.sinks)}")
+        with status_line(status):
+            summary = run.run()
+        if args.save_session:
+            save_session(args.save_session, tracker)
+    return summary
+
+
+def open_sinks(source: Source, destinations: list[str], status: LiveStatus, stack: ExitStack) -> list[Sink]:
+    """The ways out: OSC, and the answers where clients of the authors' server drive the source."""
+    from ..streams.osc import OscSink
+
+    sinks: list[Sink] = []
+    for destination in destinations:
+        sink = OscSink(destination)
+        sink.numbers = lambda: status.numbers
+        sinks.append(sink)
+    if hasattr(source, "wait_until_ready"):
+        from ..streams.authors import AuthorsSink
+
+        sinks.append(AuthorsSink(source.reply))
+    for each in sinks:
+        stack.callback(each.close)
+    return sinks
+
+
+def serve_controls(address: str | None, controls: ControlQueue, stack: ExitStack) -> None:
+    """Listens for control messages. That the usual port is taken stops no run, unless it was asked for."""
+    from ... import InputError
+    from ..streams.control_osc import DEFAULT_CONTROL, OscControl
+
+    try:
+        control = stack.enter_context(OscControl(address or DEFAULT_CONTROL, controls))
+    except InputError as reason:
+        if address:
+            raise
+        say(f"no control over OSC: {reason}")
+    else:
+        say(f"control over OSC at {control.address}")
+
+
+def estimate_beside(run: LiveRun, stack: ExitStack) -> None:
+    """Lets a thread estimate the speaker from the last seconds while the loop runs."""
+    from ..background import BackgroundSpeaker
+
+    setup = run.tracker.setup
+    run.background = BackgroundSpeaker(
+        run.tracker.model.at(setup.vertices),
+        setup.session.energy,
+        run.fix_after_s,
+        1.0 / run.tracker.period_s,
+    )
+    stack.callback(run.background.close)
+    run.background.warm_up()
+
+
+def save_session(path: str, tracker: Tracker) -> None:
+    """What was estimated in the run, to be edited and used again."""
+    from ...atomic import write_atomically
+    from ..session import session_toml
+
+    write_atomically(path, session_toml(tracker.setup.session).encode())
+    say(f"written: {path}")
+
+
+def say(text: str) -> None:
+    """A line for people."""
+    print(text, file=sys.stderr, flush=True)
