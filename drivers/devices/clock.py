@@ -64,7 +64,7 @@ class FrameClock:
         by, by_s = number - self._last[0], time_s - self._last[1]
         if by == 0 and by_s == 0.0:
             # A device whose two clocks both stand still sends frames all the same.
-            return Verdict.DUPLICATE if self._step or self._period_s else Verdict.NEXT
+            return Verdict.DUPLICATE if self._number_steps or self._time_steps else Verdict.NEXT
         verdict = self._moved(by, by_s)
         if verdict in (Verdict.NEXT, Verdict.GAP, Verdict.RESET):
             self._last = (number, time_s)
