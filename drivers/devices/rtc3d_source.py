@@ -232,7 +232,7 @@ class Rtc3dConversation:
             )
         return CoilFrame(
             self._positions,
-            head.time_us * 1e-6,
+            head.time_us / 1e6,
             head.number,
             self._arrival_ns,
             self._quaternions,

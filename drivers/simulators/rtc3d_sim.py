@@ -22,7 +22,9 @@ from .motion import DeviceClock, DeviceFrame, SimulatedMotion
 TICK_S = 0.1
 STALL_TICK_S = 0.005
 DROP_AFTER_S = 2.0  # a client that has taken nothing for so long, though something waits for it
-FULL_BYTES = 1 << 18  # no frames are made for a client for which so much is waiting
+FULL_BYTES = (
+    1 << 18
+)  # no frames are made for a client for which so much is waiting, beside the system's buffer
 FRAMES_A_TURN = 64  # then the others have their turn
 MOST_CLIENTS = 64
 LONGEST_COMMAND = 1024
@@ -47,6 +49,7 @@ class Client:
     def __init__(self, connected: socket.socket, plan: FaultPlan) -> None:
         connected.setblocking(False)
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, FULL_BYTES)
         self.socket = connected
         self.reader = rtc3d.PacketReader()
         self.order = rtc3d.BIG
