@@ -475,7 +475,7 @@ class NdiConversation:
         for tool in tracking.tools:
             if tool.handle in self._index and tool.state in (ndi.State.VALID, ndi.State.MISSING):
                 newest = max(newest, tool.frame_number)
-        if newest < 0 or self._newest - 2 * self._usual_step <= newest <= self._newest:
+        if newest <= 0 or self._newest - 2 * self._usual_step <= newest <= self._newest:
             pause_s = min(LONGEST_PAUSE_S, self._period_s * PAUSE_SHARE)
             self._next_poll_s = time.perf_counter() + pause_s
             return None
