@@ -37,7 +37,7 @@ import numpy as np
 from tonguetrack.drivers.frames import Recording
 from tonguetrack.drivers.simulators.faults import parse_faults
 from tonguetrack.drivers.simulators.motion import SimulatedMotion
-from tonguetrack.drivers.simulators.ndi_ports import run_ndi
+from tonguetrack.drivers.simulators.ndi_sim import run_ndi
 
 options = json.loads(sys.argv[1])
 positions = np.array(json.load(sys.stdin), dtype=float)

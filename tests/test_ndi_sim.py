@@ -24,7 +24,7 @@ from tonguetrack.drivers.devices.ndi import Reply as WholeReply
 from tonguetrack.drivers.frames import Recording
 from tonguetrack.drivers.simulators.faults import parse_faults
 from tonguetrack.drivers.simulators.motion import SimulatedMotion
-from tonguetrack.drivers.simulators.ndi_sim import MAX_COMMAND, NdiDevice, without_roll
+from tonguetrack.drivers.simulators.ndi_device import MAX_COMMAND, NdiDevice, without_roll
 
 COILS = ("tip", "blade", "dorsum")
 FRAMES = 80
@@ -44,8 +44,9 @@ class Client:
     def __init__(self, faults: str = "", model: str = "aurora", **options) -> None:
         self.time_s = 100.0
         source = options.pop("recording", None) or recording()
+        motion = SimulatedMotion(source, options.pop("rate_hz", None))
         plan = parse_faults(faults, COILS)
-        self.device = NdiDevice(SimulatedMotion(source), plan, model, now=lambda: self.time_s, **options)
+        self.device = NdiDevice(motion, plan, model, now=lambda: self.time_s, **options)
 
     def raw(self, data: bytes) -> bytes:
         return b"".join(answer.data for answer in self.device.feed(data))
@@ -388,7 +389,7 @@ def test_tx_and_bx_agree_with_each_other_and_with_the_motion(options: int, model
     positions = np.random.default_rng(4).normal(scale=60.0, size=(FRAMES, 3, 3)).round(2)
     positions[:, 1] = np.nan
     step = {"aurora": 8, "polaris": 1}[model]
-    client = Client(model=model, recording=recording(positions), rate_hz=40.0)
+    client = Client(model=model, recording=recording(positions))
     client.track(wait_s=0.5 / 40)
     for number in range(1, 30):
         client.time_s += 1 / 40
@@ -416,11 +417,11 @@ def test_before_the_first_measurement_a_tool_is_missing_with_frame_zero() -> Non
 
 
 @pytest.mark.parametrize(("model", "step", "rate_hz"), [("aurora", 8, 40.0), ("polaris", 1, 60.0)])
-def test_the_frame_counter_has_the_step_and_the_rate_of_the_model(
+def test_the_frame_counter_has_the_step_of_the_model_and_the_rate_of_the_motion(
     model: str, step: int, rate_hz: float
 ) -> None:
-    client = Client(model=model)
-    client.track(wait_s=0.5 / rate_hz)
+    client = Client(model=model, rate_hz=rate_hz)
+    client.track(wait_s=0.75 / rate_hz)
     numbers = []
     for _ in range(20):
         client.time_s += 0.5 / rate_hz
@@ -456,7 +457,7 @@ def test_a_tool_out_of_volume_is_missing_unless_it_is_asked_for() -> None:
 
 
 def test_a_missing_tool_of_a_polaris_has_an_older_frame_number_than_the_others() -> None:
-    client = Client(faults="dead=blade", model="polaris", rate_hz=40.0)
+    client = Client(faults="dead=blade", model="polaris")
     client.track()
     assert [tool.frame_number for tool in client.bx().tools] == [7, 5, 7]
 
