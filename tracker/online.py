@@ -29,7 +29,7 @@ RESET_S = 0.25
 """After a gap this long the pose no longer follows from the one before it."""
 RESET_PERIODS = 4.0
 """For slow devices: a gap is at least so many frames."""
-DEFAULT_PERIOD_S = 0.004
+DEFAULT_RATE_HZ = 250.0
 
 
 class Tracker:
@@ -41,7 +41,7 @@ class Tracker:
     watchful: for live sources. Bad coils lose their say (`guard.CoilGuard`), a pose without coils drifts back
     to the mean, after a gap the tracker starts anew. Otherwise every coil is believed and every frame follows
     the last one: the poses are those of `track_recording`, bit for bit.
-    rate_hz: nominal, 0.0 = unknown. fix_after_s: with a free speaker, so much tracked speech is averaged and
+    rate_hz: nominal, 0.0 = unknown: then that of most devices. fix_after_s: with a free speaker, so much tracked speech is averaged and
     the speaker then fixed (paper, section "Experiments"); None = never by itself.
     period_s: the nominal time between frames. changes: grows with every change of the set-up, for those who have to pass it on.
     """
@@ -56,7 +56,8 @@ class Tracker:
     ) -> None:
         self.model = model
         self._watchful = watchful
-        self.period_s = 1.0 / rate_hz if rate_hz > 0 else DEFAULT_PERIOD_S
+        self.rate_hz = rate_hz if rate_hz > 0 else DEFAULT_RATE_HZ
+        self.period_s = 1.0 / self.rate_hz
         self._reset_s = max(RESET_S, RESET_PERIODS * self.period_s)
         self._fix_after_s = fix_after_s
         self.changes = -1

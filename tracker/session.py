@@ -123,15 +123,24 @@ def load_session(path: str | Path) -> Session:
     if path.stat().st_size > MAX_SESSION_BYTES:
         raise InputError(f"{path}: {path.stat().st_size} bytes are too many for a session file.")
     try:
-        content = tomllib.loads(path.read_bytes().decode())
-    except RecursionError as reason:
-        raise InputError(f"{path}: this is nested too deeply to be a session file.") from reason
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as reason:
+        text = path.read_bytes().decode()
+    except UnicodeDecodeError as reason:
         raise InputError(f"{path}: this is not readable TOML ({reason}).") from reason
+    return parse_session(text, str(path))
+
+
+def parse_session(text: str, source: str) -> Session:
+    """A session from the text of a file. Raises InputError that names `source`, the table and the key at fault."""
     try:
-        return _session_from(content, str(path))
+        content = tomllib.loads(text)
+    except RecursionError as reason:
+        raise InputError(f"{source}: this is nested too deeply to be a session file.") from reason
+    except tomllib.TOMLDecodeError as reason:
+        raise InputError(f"{source}: this is not readable TOML ({reason}).") from reason
+    try:
+        return _session_from(content, source)
     except InputError as reason:
-        raise InputError(f"{path}: {reason}") from reason
+        raise InputError(f"{source}: {reason}") from reason
 
 
 def session_toml(session: Session) -> str:

@@ -140,7 +140,6 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
 
     with announced_compilation():
         tracker.warm_up()
-    rate_hz = 1.0 / tracker.period_s
     status = LiveStatus(tracker.setup.roles)
     controls = ControlQueue()
     with ExitStack() as stack:
@@ -148,7 +147,7 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
         keeper = None
         if args.record:
             keeper = TakeKeeper(
-                args.record, lambda frame: take_info(source, frame, tracker.model, tracker.setup, rate_hz)
+                args.record, lambda frame: take_info(source, frame, tracker.model, tracker.setup, tracker.rate_hz)
             )
         serve_controls(args.control, controls, stack)
         recording = lambda: keeper is not None and keeper.recorder is not None
@@ -157,7 +156,7 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
         run = LiveRun(
             source,
             tracker,
-            stream_info(tracker.model, tracker.setup, rate_hz),
+            stream_info(tracker.model, tracker.setup, tracker.rate_hz),
             status,
             status.sinks,
             keeper,
