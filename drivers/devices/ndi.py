@@ -265,17 +265,24 @@ class PortInformation:
 
 
 BUTTON_BOX = 0x03
-PHINF_TOOL, PHINF_PART_NUMBER, PHINF_LOCATION = 0x0001, 0x0004, 0x0020
+PHINF_TOOL, PHINF_PART_NUMBER, PHINF_LOCATION, PHINF_GPIO = 0x0001, 0x0004, 0x0020, 0x0040
 _PHINF_SIZES = {0x0001: 33, 0x0002: 8, 0x0004: 20, 0x0008: 2, 0x0010: 2, 0x0020: 14, 0x0040: 2}
 
 
 def parse_phinf(text: str, options: int) -> PortInformation:
-    """The reply to PHINF: the fields that were asked for, lowest option first. Raises NdiDamaged."""
+    """The reply to PHINF: the fields that were asked for, lowest option first; none for an empty port.
+
+    Raises NdiDamaged.
+    """
+    if text == State.UNOCCUPIED.name:
+        return PortInformation()
     cursor = _Cursor(text)
     tool, part_number, location = None, "", None
     for option, size in _PHINF_SIZES.items():
         if not options & option:
             continue
+        if option == PHINF_GPIO and cursor.at_end:
+            break  # devices older than this field leave it out
         if option == PHINF_TOOL:
             tool_type = cursor.hex(2)
             cursor.take(6)
@@ -806,8 +813,12 @@ class _Cursor:
         if self.take(len(text)) != text:
             raise NdiDamaged(f"{text!r} is missing at {self._at - len(text)}")
 
+    @property
+    def at_end(self) -> bool:
+        return self._at == len(self._text)
+
     def end(self) -> None:
-        if self._at != len(self._text):
+        if not self.at_end:
             raise NdiDamaged(f"{len(self._text) - self._at} characters too many")
 
 
