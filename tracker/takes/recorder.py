@@ -144,6 +144,10 @@ class TakeRecorder:
         header = file_header({"datetime": self._info.started}) + header_bytes(self._info)
         try:
             self._file = AppendedFile(self.path, self._write, self._sync)
+        except FileNotFoundError as reason:
+            raise InputError(
+                f"{self.path}: the folder {self.path.parent} does not exist; create it or choose another."
+            ) from reason
         except OSError as reason:
             raise InputError(f"{self.path}: cannot record here, {words_for(reason)}.") from reason
         journal = journal_path(self.path)
@@ -317,18 +321,20 @@ class TakeRecorder:
     # The flusher's thread ---------------------------------------------------------------------------
 
     def _flush_all(self) -> None:
-        due_s, flushed_bytes = time.monotonic(), 0
+        due_s, flushed = time.monotonic(), (0, self.bytes_written)
         while not self._flusher_ends.wait(max(0.0, due_s - time.monotonic())) and self.failure is None:
             due_s = time.monotonic() + FLUSH_EVERY_S
-            arrival_ns, last, size = self._written_ns, self._written, self.bytes_written
-            if size == flushed_bytes:
+            arrival_ns = self._written_ns
+            reached = (self._written, self.bytes_written)
+            if reached == flushed:
                 continue
             try:
                 self._file.flush()
             except OSError as reason:
                 self._fail(words_for(reason))
                 return
-            self._flushed, flushed_bytes = last, size
+            flushed = reached
+            self._flushed = reached[0]
             self._flushed_ns = max(arrival_ns, self._flushed_ns)
 
 
