@@ -534,7 +534,7 @@ def expected_positions(frame, rate=250.0):
 
 
 @pytest.mark.parametrize("layout", ["ag500", "ag501-16", "ag501-head"])
-def test_the_simulator_streams_its_motion_in_its_layout(simulated, layout):
+def test_the_simulator_streams_its_motion_in_a_layout(simulated, layout):
     address = simulated(layout=layout)
     assert re.fullmatch(rf"carstens://127\.0\.0\.1:\d+\?layout={layout}", address)
     with open_carstens(parse_source(address)) as source:
