@@ -26,6 +26,8 @@ from .common import UNITS_MM, Options, check_rate, clean, coverage_notes, even_t
 TAKE_MARK, TAKE_VERSION = "tonguetrack_take", "1"
 RAW = "raw"
 LARGEST_STATUS = 0xFFFFFFFF
+LONGEST_TAKE_S = 1e7
+"""A time stamp farther from the first one is damaged."""
 _EXACT = 2.0**53  # whole numbers up to here are the same as float64
 
 _UNIT_WORDS = {
@@ -160,12 +162,13 @@ def _take_times(
 ) -> tuple[FloatArray, float, list[str]]:
     """Seconds since the first frame's arrival, strictly increasing, the rate, and notes."""
     usual_hz = asked_hz or nominal_hz
-    if not np.isfinite(stamps).all():
+    with np.errstate(invalid="ignore", over="ignore"):
+        times = stamps - stamps[0]
+    if not (np.abs(times) < LONGEST_TAKE_S).all():
         if not usual_hz:
             raise InputError(f"{name}: the time stamps are damaged; pass the sampling rate with --rate.")
         note = f"Time stamps are damaged; times were counted from {usual_hz:g} Hz."
         return even_times(len(stamps), check_rate(usual_hz, name)), usual_hz, [note]
-    times = stamps - stamps[0]
     notes = []
     moved = int(np.count_nonzero(np.diff(times) <= 0))
     if moved:
@@ -263,7 +266,9 @@ def _from_stream(
     if stream.count == 0:
         raise InputError(f"{name}: the stream '{stream.name}' has no samples.")
     unit, notes = _unit(stream, coils, name, options.unit)
-    times, rate_hz, more = frame_times(stream.stamps, name, options.rate_hz, stream.rate_hz or None)
+    with np.errstate(invalid="ignore", over="ignore"):
+        since_first = stream.stamps - stream.stamps[0]
+    times, rate_hz, more = frame_times(since_first, name, options.rate_hz, stream.rate_hz or None)
     if stream.rate_hz and not options.rate_hz:
         rate_hz = check_rate(stream.rate_hz, name)
     columns = [column for coil in coils for column in coil.columns]
@@ -279,7 +284,7 @@ def _from_stream(
     return Recording(
         coils=tuple(names),
         positions=positions,
-        times_s=times - times[0],
+        times_s=times,
         rate_hz=rate_hz,
         format=f"XDF, stream '{stream.name}'",
         source=name,
