@@ -34,6 +34,21 @@ def cache_lasts() -> bool:
     return not _made
 
 
+def cache_folder() -> Path | None:
+    """Where numba keeps what it compiles, or will, by its rules; None where it can keep nothing."""
+    if named := os.environ.get(VARIABLE):
+        return Path(named)
+    choices = (Path(__file__).parent / "__pycache__", _users_cache())
+    return next((folder for folder in choices if _can_be_made(folder)), None)
+
+
+def has_compiled_kernels(folder: Path) -> bool:
+    """Whether a folder of the cache holds kernels that were compiled from the present source."""
+    source_ns = Path(__file__).with_name("kernels.py").stat().st_mtime_ns
+    found = [*folder.glob("kernels.*.nbi"), *folder.glob("*/kernels.*.nbi")]
+    return any(index.stat().st_mtime_ns >= source_ns for index in found)
+
+
 def _users_cache() -> Path:
     """numba's own choice, by its rules."""
     if sys.platform == "win32":
