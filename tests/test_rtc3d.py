@@ -278,17 +278,19 @@ def test_any_bytes_are_packets_or_the_error_and_the_reader_stays_small(chunks):
 
 def test_parameters_say_rate_number_and_names():
     text = rtc3d.parameters_xml(400.0, ["Sensor 1", "a<b&c"])
-    assert rtc3d.parse_parameters(text.encode() + b"\0") == rtc3d.Parameters(400.0, 2, ("Sensor 1", "a<b&c"))
+    assert rtc3d.parse_parameters(text.encode() + b"\0") == rtc3d.Parameters(400.0, ("Sensor 1", "a<b&c"))
 
 
 @pytest.mark.parametrize(
     ("text", "parameters"),
     [
         ("<x/>", rtc3d.Parameters()),
-        ("<P><General frequency='100'/></P>", rtc3d.Parameters(100.0)),
-        ("<P><Frequency>fast</Frequency><Frequency>-1</Frequency></P>", rtc3d.Parameters()),
-        ("<P xmlns='urn:x'><Rate>60.5</Rate><Markers>nan</Markers></P>", rtc3d.Parameters(60.5)),
-        ("<P><Marker name='m1'/><Marker/><Body><Name> b\n1 </Name></Body></P>", rtc3d.Parameters(names=("m1", "b1"))),
+        ("<P><Frequency>100</Frequency></P>", rtc3d.Parameters(100.0)),
+        ("<P><Frequency>fast</Frequency></P>", rtc3d.Parameters()),
+        ("<P><Frequency>-1</Frequency><Frequency/></P>", rtc3d.Parameters()),
+        ("<P xmlns='urn:x'><The_3D><Frequency>60.5</Frequency><Marker/></The_3D></P>", rtc3d.Parameters(60.5, ("",))),
+        (("<P><The_3D><Marker><Label>m</Label></Marker></The_3D><!-- two --><The_6D><Tools><Tool><Label> a\n1 </Label>"
+          "<Markers><Marker/></Markers></Tool><Tool id='2'/></Tools></The_6D></P>"), rtc3d.Parameters(0.0, ("a1", ""))),
         ("<?xml version='1.0' encoding='UTF-16'?><P><Tools>1e99</Tools></P>", rtc3d.Parameters()),
     ],
 )  # fmt: skip

@@ -498,7 +498,7 @@ def test_the_simulator_says_nothing_first_and_answers_each_command_once(quiet_de
         assert hand.ask("SendParameters All").kind == rtc3d.COMMAND
         xml = hand.hear()
         assert xml.kind == rtc3d.XML
-        assert rtc3d.parse_parameters(xml.body) == rtc3d.Parameters(RATE_HZ, 3, COILS)
+        assert rtc3d.parse_parameters(xml.body) == rtc3d.Parameters(RATE_HZ, COILS)
         assert hand.ask("Bye").kind == rtc3d.COMMAND
         assert hand.hear() is None
 

@@ -54,9 +54,9 @@ UNRELIABLE = 999.0  # of a 3D item: not available
 
 LONGEST_NAME = 64
 MOST_SENSORS = LARGEST_PACKET // 16
-PARAMETER_RATES = ("frequency", "rate", "samplerate", "framerate", "sampling_rate", "frame_rate")
-PARAMETER_COUNTS = ("tools", "bodies", "sensors", "markers")
-PARAMETER_ITEMS = ("tool", "body", "sensor", "marker")
+PARAMETER_SECTIONS = ("the_6d", "the_3d")
+PARAMETER_ITEMS = ("tool", "marker")
+PARAMETER_LABELS = ("label", "name")
 
 
 class Rtc3dError(ValueError):
@@ -327,54 +327,48 @@ def _floats(body: bytes, order: str, head: ComponentHead) -> NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Parameters:
-    """What the device says of itself. rate_hz: 0.0, sensors: 0, names: empty = it does not say."""
+    """What the device says of itself. rate_hz: 0.0 = it does not say.
+
+    names: one for each tool, or marker where there are no tools; "" = it has none.
+    """
 
     rate_hz: float = 0.0
-    sensors: int = 0
     names: tuple[str, ...] = ()
 
 
 def parameters_xml(rate_hz: float, names: Sequence[str]) -> str:
-    """The parameters as the simulator states them. Those of real devices are not published."""
-    tools = "".join(f"<Tool><Name>{escape(name)}</Name></Tool>" for name in names)
+    """The parameters of a device with these tools, in the shape in which an emulator of the Wave states them."""
+    tools = "".join(
+        f"<Tool id='{k + 1}'><Label>{escape(name)}</Label></Tool>" for k, name in enumerate(names)
+    )
     return (
-        f'<?xml version="1.0" encoding="US-ASCII"?><Parameters><The_6D><Tools>{len(names)}</Tools>'
-        f"<Frequency>{rate_hz:g}</Frequency>{tools}</The_6D></Parameters>"
+        "<?xml version='1.0' encoding='US-ASCII'?><RT_Parameters Ver='1.00'><The_6D>"
+        f"<Frequency>{rate_hz:g}</Frequency><Unit>mm</Unit><Tools>{tools}</Tools></The_6D></RT_Parameters>"
     )
 
 
 def parse_parameters(body: bytes) -> Parameters:
-    """Whatever of rate, number and names can be made out; everything may be absent.
+    """Whatever of rate and names can be made out; everything may be absent, for no device's own is published.
 
-    Raises Rtc3dError where the text is no XML, or declares anything (`<!`): a declaration could make it grow.
+    Raises Rtc3dError where the text is no XML, or declares anything: a declaration could make it grow.
     """
     if len(body) > LARGEST_PACKET:
         raise Rtc3dError(f"parameters of {len(body)} bytes; expected at most {LARGEST_PACKET}")
     text = text_of(body)
-    if "<!" in text:
+    if text.count("<!") > text.count("<!--"):
         raise Rtc3dError("parameters with declarations are not read")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as reason:
         raise Rtc3dError(f"parameters that are no XML ({reason})") from reason
-    rate_hz, sensors, names = 0.0, 0, []
-    for element in root.iter():
-        tag = _plain(element.tag)
-        values = {_plain(name): value for name, value in element.attrib.items()}
-        values[tag] = (element.text or "").strip()
-        for name, value in values.items():
-            if name in PARAMETER_RATES and not rate_hz:
-                rate_hz = _number(value, 0.1, 1e5)
-            elif name in PARAMETER_COUNTS and not sensors:
-                sensors = int(_number(value, 1, MOST_SENSORS))
-        if tag in PARAMETER_ITEMS:
-            name = values.get("name") or next(
-                (child.text or "" for child in element if _plain(child.tag) == "name"), ""
-            )
-            name = "".join(letter for letter in name.strip() if letter.isprintable())[:LONGEST_NAME]
-            if name:
-                names.append(name)
-    return Parameters(rate_hz, sensors, tuple(names))
+    found = {_plain(element.tag): element for element in root}
+    section = next((found[name] for name in PARAMETER_SECTIONS if name in found), root)
+    rate_hz = next((_rate(e.text) for e in section.iter() if _plain(e.tag) == "frequency"), 0.0)
+    for item in PARAMETER_ITEMS:
+        items = [element for element in section.iter() if _plain(element.tag) == item]
+        if items:
+            return Parameters(rate_hz, tuple(_label(element) for element in items))
+    return Parameters(rate_hz)
 
 
 def _plain(tag: object) -> str:
@@ -382,10 +376,14 @@ def _plain(tag: object) -> str:
     return tag.rpartition("}")[2].lower() if isinstance(tag, str) else ""
 
 
-def _number(text: str, low: float, high: float) -> float:
-    """The number, or 0.0 where there is none in that range."""
+def _rate(text: str | None) -> float:
     try:
-        value = float(text)
+        value = float(text or "")
     except ValueError:
         return 0.0
-    return value if low <= value <= high else 0.0
+    return value if 0.1 <= value <= 1e5 else 0.0
+
+
+def _label(element: ElementTree.Element) -> str:
+    text = next((child.text for child in element if _plain(child.tag) in PARAMETER_LABELS), None) or ""
+    return "".join(letter for letter in text.strip() if letter.isprintable())[:LONGEST_NAME]
