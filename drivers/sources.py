@@ -233,7 +233,10 @@ def parse_source(text: str) -> SourceAddress:
     if kind.scheme == "ndi":
         if not place:
             raise InputError(f"'{text}': the serial port is missing, as in {kind.forms} or ndi://COM3.")
-        return SourceAddress(kind, text, path=unquote(place), options=options)
+        path = unquote(place)
+        if not path.isprintable():
+            raise InputError(f"'{text}': a serial port has no such name; expected {kind.forms}.")
+        return SourceAddress(kind, text, path=path, options=options)
     host, port = _host_and_port(place.rstrip("/"), kind, text)
     return SourceAddress(kind, text, host=host, port=port, options=options)
 
@@ -269,7 +272,7 @@ def open_replay(address: SourceAddress) -> Source:
 def _host_and_port(place: str, kind: SourceKind, text: str) -> tuple[str, int]:
     host, colon, port = place.rpartition(":")
     if not colon or place.endswith("]"):  # no port, perhaps an IPv6 address in brackets
-        host, port = place, str(kind.port)
+        host, port = place, str(kind.port or "")
     if host.startswith("[") and host.endswith("]"):
         host = host[1:-1]
     elif ":" in host:
@@ -278,6 +281,8 @@ def _host_and_port(place: str, kind: SourceKind, text: str) -> tuple[str, int]:
         raise InputError(f"'{text}': the host is missing, as in {kind.forms}.")
     if any(c.isspace() or c in "/[]@" for c in host):
         raise InputError(f"'{text}': '{host}' is not a host; expected {kind.forms}.")
+    if not port:
+        raise InputError(f"'{text}': the port is missing, as in {kind.forms}.")
     if not (port.isascii() and port.isdigit() and 1 <= int(port) <= 65535):
         raise InputError(f"'{text}': the port '{port}' should be a number from 1 to 65535.")
     return host, int(port)
