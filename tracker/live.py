@@ -193,7 +193,9 @@ class LiveRun:
                 return False
             if setup is not self.tracker.setup:
                 self.tracker.change(setup)
-        if note.kind in (NoteKind.SILENT, NoteKind.DISCONNECTED) and status.frames:
+        silent = note.kind in (NoteKind.SILENT, NoteKind.DISCONNECTED)
+        # Clients that drive the source are answered for their frames only.
+        if silent and status.frames and self.handles is None:
             status.silent_s = (note.arrival_ns - status.last_arrival_ns) * 1e-9
             self._show(self.tracker.idle(status.silent_s))
         if note.kind is not NoteKind.SILENT:

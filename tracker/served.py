@@ -7,13 +7,13 @@ otherwise: no bias, coherence 1, a box of one sigma.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from .. import InputError
-from ..drivers.frames import SourceNote
+from ..drivers.frames import CoilFrame, SourceNote
 from ..model.multilinear import TongueModel
 from .online import Tracker
 from .preparation import Preparation
@@ -49,6 +49,13 @@ def setup_for_points(
     roles = tuple(name.replace(" ", "_") for name in coils)
     preparation = Preparation(np.arange(len(vertices)), own.alignment)
     return Setup(tuple(coils), roles, tuple(int(v) for v in vertices), preparation, own, ())
+
+
+def next_vertices(source: Iterable[CoilFrame | SourceNote]) -> None:
+    """Reads on until a client names vertices, or the source ends."""
+    for item in source:
+        if isinstance(item, SourceNote) and item.command == "set_vertices":
+            return
 
 
 def obey_client(note: SourceNote, tracker: Tracker) -> Setup | None:

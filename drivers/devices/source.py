@@ -17,6 +17,8 @@ TICK_S = 0.1
 """How long one wait lasts at most, and so how long `stop` takes to be noticed."""
 IDLE_S = 5.0
 """A device that is connected but sends nothing for this long is connected to anew."""
+CATCH_UP_S = 1.0
+"""A device that sends as fast as it is read is not waited for any longer."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0
 """Pauses between attempts to connect: doubled each time up to the longest."""
 
@@ -111,6 +113,19 @@ class DeviceSource:
         conversation, self._conversation = self._conversation, None
         if conversation is not None:
             conversation.goodbye()
+
+    def catch_up(self) -> None:
+        """Leaves out what came while nobody read, so that the next frame is a fresh one."""
+        deadline_s = time.perf_counter() + CATCH_UP_S
+        self._queue.clear()
+        try:
+            while self._conversation is not None and time.perf_counter() < deadline_s:
+                if self._conversation.receive(0.0) is None:
+                    break
+        except LinkLost as reason:
+            self._queue.append(self._lose(str(reason)))
+        self._clock.restart()
+        self._heard_s = time.perf_counter()
 
     def __next__(self) -> CoilFrame | SourceNote:
         while not self._stopped:

@@ -12,6 +12,7 @@ from .demo import positive_seconds
 from .names import BUNDLED
 
 if TYPE_CHECKING:
+    from ...drivers.devices.authors_live import AuthorsLive
     from ...drivers.sources import Source
     from ...model.multilinear import TongueModel
     from ..control import ControlQueue
@@ -102,20 +103,16 @@ def run_source(
     args: argparse.Namespace, source: Source, model: TongueModel, session: Session, destinations: list[str]
 ) -> Summary | None:
     """One run; where clients drive the source, one after the other until it is stopped."""
+    from ...drivers.devices.authors_live import AuthorsLive
     from ..gathering import recording_for_setup
     from ..online import Tracker
-    from ..served import setup_for_points
     from ..session import NO_SESSION
     from ..setup import complete_setup
 
-    if hasattr(source, "wait_until_ready"):
-        stated = session if session.source != NO_SESSION else None
-        summary = None
-        say(f"{source.address}: waiting for a client to name its vertices")
-        while source.wait_until_ready():
-            setup = setup_for_points(model, source.coils, source.vertices, stated)
-            summary = run_once(args, source, Tracker(model, setup, source.rate_hz), destinations)
-        return summary
+    if isinstance(source, AuthorsLive):
+        return serve_clients(
+            args, source, model, session if session.source != NO_SESSION else None, destinations
+        )
     recording = recording_for_setup(source, session, LISTEN_S, lambda note: say(note.text))
     setup = complete_setup(recording, model, session)
     for decision in setup.decisions:
@@ -127,8 +124,37 @@ def run_source(
     return run_once(args, source, tracker, destinations)
 
 
+def serve_clients(
+    args: argparse.Namespace,
+    source: AuthorsLive,
+    model: TongueModel,
+    session: Session | None,
+    destinations: list[str],
+) -> Summary | None:
+    """A run for each set of vertices that clients of the authors' server name, until the source is stopped."""
+    from ... import InputError
+    from ..online import Tracker
+    from ..served import next_vertices, setup_for_points
+
+    summary = None
+    say(f"{source.address}: waiting for a client to name its vertices")
+    while source.wait_until_ready():
+        try:
+            setup = setup_for_points(model, source.coils, source.vertices, session)
+        except InputError as reason:  # one client's mistake is not the end for the others
+            say(str(reason))
+            next_vertices(source)
+            continue
+        summary = run_once(args, source, Tracker(model, setup, source.rate_hz), destinations)
+        if source.vertices == setup.vertices:
+            break
+    return summary
+
+
 def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destinations: list[str]) -> Summary:
     """Tracks with everything around it: sinks, takes, controls, the status line."""
+    from ...drivers.devices.authors_live import AuthorsLive
+    from ...drivers.devices.source import DeviceSource
     from ..control import ControlQueue
     from ..keyboard import KEYS, watched_keys
     from ..live import LiveRun, stream_info
@@ -140,6 +166,8 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
 
     with announced_compilation():
         tracker.warm_up()
+    if isinstance(source, DeviceSource):
+        source.catch_up()
     status = LiveStatus(tracker.setup.roles)
     controls = ControlQueue()
     with ExitStack() as stack:
@@ -147,7 +175,8 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
         keeper = None
         if args.record:
             keeper = TakeKeeper(
-                args.record, lambda frame: take_info(source, frame, tracker.model, tracker.setup, tracker.rate_hz)
+                args.record,
+                lambda frame: take_info(source, frame, tracker.model, tracker.setup, tracker.rate_hz),
             )
         serve_controls(args.control, controls, stack)
         recording = lambda: keeper is not None and keeper.recorder is not None
@@ -164,7 +193,7 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
             fix_after_s=args.fix_speaker_after,
             seconds=args.seconds,
             said=say_above,
-            handles=obey_client,
+            handles=obey_client if isinstance(source, AuthorsLive) else None,
         )
         if args.speaker == "joint" and tracker.setup.session.speaker_weights is None:
             estimate_beside(run, stack)
@@ -178,6 +207,8 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
 
 def open_sinks(source: Source, destinations: list[str], status: LiveStatus, stack: ExitStack) -> list[Sink]:
     """The ways out: OSC, and the answers where clients of the authors' server drive the source."""
+    from ...drivers.devices.authors_live import AuthorsLive
+    from ..streams.authors import AuthorsSink
     from ..streams.osc import OscSink
 
     sinks: list[Sink] = []
@@ -185,9 +216,7 @@ def open_sinks(source: Source, destinations: list[str], status: LiveStatus, stac
         sink = OscSink(destination)
         sink.numbers = lambda: status.numbers
         sinks.append(sink)
-    if hasattr(source, "wait_until_ready"):
-        from ..streams.authors import AuthorsSink
-
+    if isinstance(source, AuthorsLive):
         sinks.append(AuthorsSink(source.reply))
     for each in sinks:
         stack.callback(each.close)

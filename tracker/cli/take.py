@@ -23,6 +23,11 @@ def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]
 
     info = actions.add_parser("info", help="what a take holds, how the tracking went, whether it is whole")
     info.add_argument("file", help="a take")
+    info.add_argument("--check", action="store_true",
+                      help="track it once more and compare every bit; exit code 1 where one differs")  # fmt: skip
+    info.add_argument(
+        "--model", default=BUNDLED, help="the model of the take, for --check (default: the bundled one)"
+    )
     info.add_argument("--json", action="store_true", help="the same as JSON, for scripts")
     info.set_defaults(run=run_info)
 
@@ -45,7 +50,7 @@ def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]
     export.add_argument(
         "--model",
         default=BUNDLED,
-        help="the model of the take, for poses as .json (default: the bundled one)",
+        help="the model of the take, for poses (default: the bundled one)",
     )
     export.set_defaults(run=run_export)
 
@@ -68,9 +73,14 @@ def run_info(args: argparse.Namespace) -> int:
     from ..takes.reading import read_take
     from ..takes.summary import summary_of
 
-    summary = summary_of(read_take(args.file))
+    take = read_take(args.file)
+    summary = summary_of(take)
+    if args.check:
+        from ..takes.retrack import retrack
+
+        summary["differing_frames"] = retrack(take, named_model(args.model)).differing.tolist()
     print(json.dumps(summary, indent=2, allow_nan=False) if args.json else info_text(summary))
-    return 0
+    return 1 if summary.get("differing_frames") else 0
 
 
 def run_recover(args: argparse.Namespace) -> int:
@@ -97,7 +107,8 @@ def run_export(args: argparse.Namespace) -> int:
     for sentence in (take.damage, take.journal_note):
         if sentence:
             print(f"note: {sentence}")
-    print(export(take, args.what, output, lambda: named_model(args.model)))
+    place = BUNDLED if args.model == BUNDLED else str(Path(args.model).resolve())
+    print(export(take, args.what, output, lambda: named_model(args.model), place))
     return 0
 
 
@@ -152,6 +163,13 @@ def info_text(summary: dict[str, Any]) -> str:
                 text = "changed (`take export --what session` writes the last one)"
             lines.append(f"    {mark['time_s']:9.3f} s  {kind}{text}")
     lines += [f"  - {sentence}" for sentence in (summary["damage"], summary["journal"]) if sentence]
+    if "differing_frames" in summary:
+        differing = summary["differing_frames"]
+        lines.append(
+            f"  tracked again: {len(differing)} of {summary['frames']} poses differ, the first in frame {differing[0]}"
+            if differing
+            else f"  tracked again: all {summary['frames']} poses come out the same, bit for bit"
+        )
     return "\n".join(lines)
 
 
