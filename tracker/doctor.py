@@ -172,8 +172,7 @@ def _clock() -> Iterator[Finding]:
 
 
 def _processors() -> Iterator[Finding]:
-    has_affinity = hasattr(os, "sched_getaffinity")
-    count = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+    count = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     if count < FEW_CPUS:
         yield Finding(
             "CPUs", "note", f"{count}: tracking shares it with everything else", "give it a second one"
