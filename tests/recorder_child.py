@@ -23,6 +23,7 @@ from tonguetrack.tracker.takes.layout import TakeInfo
 from tonguetrack.tracker.takes.recorder import TakeRecorder
 
 COILS, ROLES, POSE, SPEAKER = 16, 3, 4, 10
+MARK_EVERY = 25
 PATTERN = np.random.default_rng(5).normal(size=400)
 
 
@@ -124,12 +125,14 @@ def record_until_killed(take: str, fifo: str, rate_hz: float, disk: str) -> None
             time.sleep(0.2 if disk == "slow" else 60.0)
         return os.write(handle, data)
 
-    recorder = TakeRecorder(take_info(rate_hz or 2000.0), take, write)
+    recorder = TakeRecorder(take_info(rate_hz / 4 or 1000.0), take, write)  # a smaller journal than usual
     recorder.open()
     opened = True
     sequence, begin_s = 0, time.perf_counter()
     while True:
         sequence += 1
+        if sequence % MARK_EVERY == 0:
+            recorder.mark(f"before {sequence}", 1_000_000 * sequence)
         put(recorder, sequence)
         os.write(report, struct.pack("<q", sequence))
         if rate_hz:

@@ -18,7 +18,14 @@ from hypothesis import strategies as st
 from tonguetrack import InputError
 from tonguetrack.drivers.xdf import BOUNDARY_UUID, read_xdf
 from tonguetrack.tracker.takes import recorder as recorder_module
-from tonguetrack.tracker.takes.journal import SLOTS_AT, Journal, journal_path, read_journal
+from tonguetrack.tracker.takes.journal import (
+    SLOTS_AT,
+    Journal,
+    journal_path,
+    read_journal,
+    read_journal_marks,
+)
+from tonguetrack.tracker.takes.marklog import Mark, MarkLog, read_log
 from tonguetrack.tracker.takes.recorder import TakeRecorder
 from tonguetrack.tracker.takes.rows import Row
 
@@ -196,6 +203,20 @@ def test_a_mark_is_in_the_file_before_the_take_ends_even_without_frames(tmp_path
     recorder.close()
 
 
+def test_marks_stand_in_the_journal_before_the_disk_has_taken_them(tmp_path):
+    disk = Disk()
+    path = tmp_path / "take.xdf"
+    recorder = opened(path, write=disk.write)
+    disk.writing.clear()
+    recorder.mark("first", 1_000_000_000)
+    recorder.mark("second \u00e4", 2_000_000_000)
+    marks = read_journal_marks(journal_path(path), path)
+    assert marks == [Mark(1, 1.0, "first"), Mark(2, 2.0, "second \u00e4")]
+    disk.writing.set()
+    recorder.close()
+    assert streams_of(path)["markers"].texts == [("first",), ("second \u00e4",)]
+
+
 def test_an_existing_file_is_refused_and_left_as_it_is(tmp_path):
     path = tmp_path / "take.xdf"
     path.write_bytes(b"precious")
@@ -368,6 +389,22 @@ def test_a_flush_that_fails_ends_the_recording_with_a_sentence(tmp_path):
     assert_holds(tmp_path / "take.xdf", 10)
 
 
+def test_closing_gives_up_a_disk_that_takes_nothing_any_more(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder_module, "CLOSE_PATIENCE_S", 0.1)
+    disk = Disk()
+    path = tmp_path / "take.xdf"
+    recorder = opened(path, write=disk.write)
+    disk.writing.clear()
+    put_all(recorder, 1, 30)
+    summary = recorder.close()
+    assert "has not answered" in summary.failure
+    assert (summary.frames, summary.journal) == (30, journal_path(path))
+    assert read_journal(summary.journal, path)["sequence"].tolist() == list(range(1, 31))
+    disk.writing.set()
+    recorder._writer.join(20.0)
+    assert not recorder._writer.is_alive()
+
+
 @pytest.mark.skipif(os.name == "nt", reason="an open file cannot be removed there")
 def test_a_take_that_somebody_removes_while_it_is_recorded_is_told(tmp_path):
     recorder = opened(tmp_path / "take.xdf")
@@ -455,6 +492,13 @@ def test_a_journal_takes_all_its_room_from_the_disk_at_once(tmp_path):
     assert getattr(state, "st_blocks", state.st_size) * 512 >= state.st_size
 
 
+def test_a_system_that_cannot_take_room_beforehand_gets_zeros_written(tmp_path, monkeypatch):
+    monkeypatch.delattr(os, "posix_fallocate", raising=False)
+    path = journal_of(tmp_path / "journal", 3, slots=1000)
+    assert read_journal(path)["sequence"].tolist() == [1, 2, 3]
+    assert getattr(path.stat(), "st_blocks", path.stat().st_size) * 512 >= path.stat().st_size
+
+
 def test_what_is_stored_in_a_released_journal_does_not_reach_the_file(tmp_path):
     info = MADE.take_info()
     journal = Journal.create(tmp_path / "journal", info.row_dtype(), 8, b"")
@@ -540,3 +584,55 @@ def test_frames_keep_their_row_when_the_sources_arrays_are_written_over(tmp_path
     positions[:] = -1.0
     recorder.close()
     assert_holds(tmp_path / "take.xdf", 1)
+
+
+# Its marks ------------------------------------------------------------------------------------------
+
+
+def log_of(memory: bytearray, marks: list[Mark], written: int = 0) -> list[Mark]:
+    log = MarkLog(memoryview(memory))
+    for mark in marks:
+        log.store(mark, written)
+    return read_log(bytes(memory))
+
+
+@given(texts=st.lists(st.text(max_size=40), max_size=30))
+@settings(max_examples=200, deadline=None)
+def test_a_log_gives_back_every_mark_in_order(texts):
+    marks = [Mark(i + 1, i / 3.0, text) for i, text in enumerate(texts)]
+    assert log_of(bytearray(10_000), marks) == marks
+
+
+def test_a_log_that_is_full_begins_anew_once_the_file_has_all_its_marks():
+    marks = [Mark(i, 0.0, "x" * 76) for i in range(1, 13)]  # 100 bytes each
+    memory = bytearray(1000)
+    assert log_of(memory, marks) == marks[:10]
+    log = MarkLog(memoryview(memory))
+    for mark in marks[:10]:
+        log.store(mark, written=0)
+    log.store(marks[10], written=9)
+    assert read_log(bytes(memory)) == marks[:10]
+    log.store(marks[10], written=10)
+    log.store(marks[11], written=10)
+    assert read_log(bytes(memory)) == marks[10:]
+
+
+def test_a_mark_that_is_longer_than_the_log_is_left_to_the_file():
+    marks = [Mark(1, 0.0, "a"), Mark(2, 0.0, "b" * 1000), Mark(3, 0.0, "c")]
+    assert log_of(bytearray(1000), marks, written=2) == [marks[0], marks[2]]
+
+
+@given(at=st.integers(0, 299), change=st.integers(1, 255))
+@settings(max_examples=200, deadline=None)
+def test_a_damaged_mark_ends_the_log_before_it(at, change):
+    marks = [Mark(i, 0.0, "x" * 76) for i in (1, 2, 3)]
+    memory = bytearray(1000)
+    log_of(memory, marks)
+    memory[at] ^= change
+    assert read_log(bytes(memory)) == marks[: at // 100]
+
+
+@given(data=st.binary(max_size=300))
+@settings(max_examples=200, deadline=None)
+def test_any_bytes_are_read_as_a_log_without_an_error(data):
+    assert len(read_log(data)) <= len(data) // 24

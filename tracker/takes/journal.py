@@ -4,10 +4,10 @@ The loop stores each row by an assignment into a shared mapping of the file. Wha
 operating system: it survives the death of the process at any instruction. It does not survive a power cut;
 against that the take itself is flushed.
 
-The file is a page with a header and then a ring of slots, each a row (`layout.row_dtype`) and a check word, the
-sum of the row's words. Row `sequence` stands in slot (sequence - 1) modulo the number of slots. A slot counts
-only where its check word, its sequence and its place agree, so a row that was cut short is left out, whether by
-a kill or, page by page, by a power cut.
+The file is a page with a header, then room for the latest marks (`marklog`), then a ring of slots, each a row
+(`layout.row_dtype`) and a check word, the sum of the row's words. Row `sequence` stands in slot (sequence - 1)
+modulo the number of slots. A slot counts only where its check word, its sequence and its place agree, so a row
+that was cut short is left out, whether by a kill or, page by page, by a power cut.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from ... import InputError
 from .layout import POSE, PREPARED, RAW, row_dtype
+from .marklog import Mark, MarkLog, read_log
 
 SUFFIX = ".journal"
 MAGIC = b"ttkjrnl\n"
@@ -35,7 +36,9 @@ VERSION = 1
 HEADER = struct.Struct("<8sIIIIIQ32s")
 """Magic, version, channels of raw, prepared and pose, slots, how many bytes at the take's beginning, their SHA-256."""
 CHECKSUM = struct.Struct("<I")  # CRC-32 of HEADER
-SLOTS_AT = 4096
+MARKS_AT = 4096
+MARKS_BYTES = 1 << 18
+SLOTS_AT = MARKS_AT + MARKS_BYTES
 MAX_CHANNELS = 1 << 16
 MAX_BYTES = 1 << 30
 MAX_TAKE_HEADER_BYTES = 64 << 20
@@ -76,7 +79,7 @@ class JournalHeader:
 
 
 class Journal:
-    """The writing side. One thread stores rows, another reads them out again.
+    """The writing side. One thread stores rows, another reads them out again; marks have a log of their own.
 
     Create with `Journal.create`. capacity: how many rows it holds.
     """
@@ -84,6 +87,8 @@ class Journal:
     def __init__(self, path: Path, mapped: mmap.mmap, header: JournalHeader) -> None:
         self.path = path
         self.capacity = header.slots
+        self.marks = MarkLog(memoryview(mapped)[MARKS_AT:SLOTS_AT])
+        self._mapped: mmap.mmap | None = mapped
         slots = np.frombuffer(mapped, slot_dtype(header.dtype), header.slots, SLOTS_AT)
         self._rows: Rows = slots["row"]
         self._words: Words = slots.view(np.int64).reshape(header.slots, -1)
@@ -120,6 +125,11 @@ class Journal:
         begin = (first - 1) % self.capacity
         return self._rows[begin : begin + min(last - first + 1, self.capacity - begin)]
 
+    def flush(self) -> None:
+        """Returns when what stands here would outlive a power cut too. Raises OSError."""
+        if self._mapped is not None:
+            self._mapped.flush()
+
     def remove(self) -> None:
         """Deletes the file. A thread that is just storing a row is not disturbed."""
         self.release()
@@ -134,6 +144,8 @@ class Journal:
             np.zeros(width, np.int64), (self.capacity, width), (0, 8)
         )
         self._rows = self._rows[:0].copy()
+        self.marks = MarkLog(memoryview(b""))
+        self._mapped = None
 
 
 def read_journal(path: str | os.PathLike[str], take: str | os.PathLike[str] | None = None) -> Rows:
@@ -144,21 +156,8 @@ def read_journal(path: str | os.PathLike[str], take: str | os.PathLike[str] | No
     take: the file that the journal should belong to; the journal of another take is refused.
     Raises InputError where a file cannot be read or the journal is none.
     """
-    name = os.fspath(path)
-    try:
-        with open(path, "rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            header = _header(file.read(HEADER.size + CHECKSUM.size), size, name)
-            file.seek(SLOTS_AT)
-            data = file.read(header.file_bytes - SLOTS_AT)
-        if take is not None:
-            with open(take, "rb") as file:
-                if hashlib.sha256(file.read(header.take_bytes)).digest() != header.digest:
-                    raise InputError(f"{name}: this journal belongs to another take; move it away.")
-    except OSError as reason:
-        raise InputError(
-            f"{reason.filename or name}: cannot be read ({reason.strerror or reason})."
-        ) from reason
+    header, data = _read(path, take)
+    data = data[MARKS_BYTES:]
     dtype = slot_dtype(header.dtype)
     slots = np.frombuffer(data, dtype, len(data) // dtype.itemsize)
     sequence = slots["row"]["sequence"]
@@ -172,9 +171,39 @@ def read_journal(path: str | os.PathLike[str], take: str | os.PathLike[str] | No
     return np.asarray(rows[np.argsort(rows["sequence"])])
 
 
+def read_journal_marks(
+    path: str | os.PathLike[str], take: str | os.PathLike[str] | None = None
+) -> list[Mark]:
+    """The latest marks of a journal, by rising number, those that the take has already among them.
+
+    take, errors: as `read_journal`.
+    """
+    return read_log(_read(path, take)[1][:MARKS_BYTES])
+
+
 def check_of(words: Words) -> Words:
     """(...,): the check word of rows as words (..., n): their sum, modulo 2^64."""
     return np.asarray(np.add.reduce(words, axis=-1, dtype=np.int64))
+
+
+def _read(path: str | os.PathLike[str], take: str | os.PathLike[str] | None) -> tuple[JournalHeader, bytes]:
+    """The header and all that follows its page."""
+    name = os.fspath(path)
+    try:
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            header = _header(file.read(HEADER.size + CHECKSUM.size), size, name)
+            file.seek(MARKS_AT)
+            data = file.read(header.file_bytes - MARKS_AT)
+        if take is not None:
+            with open(take, "rb") as file:
+                if hashlib.sha256(file.read(header.take_bytes)).digest() != header.digest:
+                    raise InputError(f"{name}: this journal belongs to another take; move it away.")
+    except OSError as reason:
+        raise InputError(
+            f"{reason.filename or name}: cannot be read ({reason.strerror or reason})."
+        ) from reason
+    return header, data
 
 
 def _header(data: bytes, size: int, name: str) -> JournalHeader:

@@ -9,8 +9,8 @@ flushed, at most 0.5 s as long as one flush lasts less than 0.15 s; `seconds_beh
 A disk that is slow to flush holds up neither of the two other threads. One that takes nothing at all for
 longer than the journal lasts (20 s) makes further frames wait in memory, where a kill would lose them.
 
-Marks go to the writer's thread directly and wake it: a kill can lose those of the last moment, or of as long
-as the disk took nothing.
+Marks wake the writer's thread and stand in the journal until then. A kill can lose one only if it is longer than
+256 KiB, or if that much came while the disk took nothing.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import os
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from .appending import AppendedFile, Sync, Write, flush_folder, flush_to_disk, w
 from .headers import header_bytes
 from .journal import Journal, Rows, Words, journal_path, slot_dtype
 from .layout import MARKERS, POSE, PREPARED, RAW, STREAM_IDS, TakeInfo
+from .marklog import Mark
 from .rows import Row
 
 WRITE_EVERY_S = 0.1
@@ -100,7 +102,9 @@ class TakeRecorder:
         self._written, self._written_ns = 0, 0
         self._flushed, self._flushed_ns = 0, 0
         self._overflow: deque[Words] = deque()
-        self._waiting_marks: deque[tuple[float, str]] = deque()
+        self._marking = threading.Lock()
+        self._waiting_marks: deque[Mark] = deque()
+        self._marks_taken = 0
         self._first_s = 0.0
         self._mark_span_s = (0.0, 0.0)
         self._marks = 0
@@ -190,9 +194,14 @@ class TakeRecorder:
 
     def mark(self, text: str, time_ns: int) -> None:
         """Puts a text into the take. time_ns: `time.perf_counter_ns()`. From any thread."""
-        if self._accepting:
-            self._waiting_marks.append((time_ns * _NS, text))
-            self._wake.set()
+        with self._marking:
+            if not self._accepting:
+                return
+            self._marks_taken += 1
+            mark = Mark(self._marks_taken, time_ns * _NS, text)
+            self._journal.marks.store(mark, self._marks)
+            self._waiting_marks.append(mark)
+        self._wake.set()
 
     def close(self) -> TakeSummary:
         """Ends the take; returns when it is whole on disk, or has failed. Again: the same summary.
@@ -242,7 +251,8 @@ class TakeRecorder:
                 self._wake.wait(WRITE_EVERY_S)
                 self._wake.clear()
                 self._drain()
-            self._finish()
+            if self.failure is None:
+                self._finish()
             whole = True
         except OSError as reason:
             self._fail(words_for(reason))
@@ -252,6 +262,9 @@ class TakeRecorder:
             self._flusher_ends.set()
             self._flusher.join()
             self._file.close()
+            if self.failure is not None:
+                with suppress(OSError):
+                    self._journal.flush()
             self._journal.release()
 
     def _drain(self) -> None:
@@ -289,11 +302,11 @@ class TakeRecorder:
         self._written_ns = last_ns
 
     def _write_marks(self) -> None:
-        marks = []
+        marks: list[Mark] = []
         while self._waiting_marks:
             marks.append(self._waiting_marks.popleft())
-        stamps_s, texts = [mark[0] for mark in marks], [mark[1] for mark in marks]
-        self._append(text_samples(STREAM_IDS[MARKERS], stamps_s, texts))
+        stamps_s = [mark.stamp_s for mark in marks]
+        self._append(text_samples(STREAM_IDS[MARKERS], stamps_s, [mark.text for mark in marks]))
         first_s = self._mark_span_s[0] if self._marks else stamps_s[0]
         self._mark_span_s = (first_s, stamps_s[-1])
         self._marks += len(marks)
