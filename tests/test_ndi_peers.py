@@ -8,16 +8,24 @@ import json
 import os
 import select
 import signal
+import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tonguetrack import InputError
 from tonguetrack.drivers.devices.ndi import command, parse_bx, parse_reply
+from tonguetrack.drivers.frames import Recording
+from tonguetrack.drivers.simulators.faults import FaultPlan
+from tonguetrack.drivers.simulators.motion import SimulatedMotion
+from tonguetrack.drivers.simulators.ndi_sim import run_ndi
 
 FRAMES, RATE_HZ = 400, 40.0
 WAIT_S = 30.0
@@ -263,6 +271,31 @@ def test_scikit_surgerynditracker_tracks_over_the_pseudo_terminal() -> None:
     assert "TX" not in commands
 
 
+SURGERY_POLARIS = """
+import json, sys
+from sksurgerynditracker.nditracker import NDITracker
+
+tracker = NDITracker({"tracker type": "polaris", "serial port": sys.argv[1], "romfiles": [sys.argv[2]]})
+tracker.start_tracking()
+handles, stamps, counts, poses, quality = tracker.get_frame()
+tracker.stop_tracking()
+tracker.close()
+print(json.dumps({"handles": handles, "quality": quality}))
+"""
+
+
+def test_scikit_surgerynditracker_loads_a_tool_that_is_never_seen(tmp_path: Path) -> None:
+    needs("sksurgerynditracker")
+    tool = tmp_path / "tool.rom"
+    tool.write_bytes(bytes(752))
+    with simulator("pty", coils=2, model="polaris") as device:
+        report = client(SURGERY_POLARIS, device.place, str(tool))
+        commands = device.commands()
+    assert report["handles"] == [0x0A + 2]
+    assert np.isnan(report["quality"]).all()
+    assert commands.count("PVWR") == 16
+
+
 # --- pyserial -------------------------------------------------------------------------------------------------
 
 
@@ -347,6 +380,55 @@ def test_a_serial_device_that_fails_is_silent_until_it_is_initialised_again() ->
             pass
         assert exchange(port, command("VER", "0"), 0.2) == b""
         assert exchange(port, command("INIT")) == b"OKAYA896\r"
+
+
+def test_clients_that_go_at_once_or_talk_nonsense_do_not_end_the_simulator() -> None:
+    with simulator("rfc2217") as device:
+        address = ("127.0.0.1", int(device.place.rpartition(":")[2]))
+        for nonsense in (b"", b"\xff\xf0", b"\xff\xfa" + 5000 * b",", b"\xff\xfa,\x01\x00\xff\xf0"):
+            with socket.create_connection(address, WAIT_S) as connection:
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                connection.sendall(nonsense)
+        with open_port(device) as port:
+            assert exchange(port, command("INIT")) == b"OKAYA896\r"
+
+
+def test_what_cannot_be_simulated_is_said_in_one_sentence() -> None:
+    coils = tuple(f"coil{number}" for number in range(65))
+    motion = SimulatedMotion(Recording(coils, np.zeros((1, 65, 3)), np.zeros(1), 40.0, "test"))
+    few = SimulatedMotion(Recording(coils[:2], np.zeros((1, 2, 3)), np.zeros(1), 40.0, "test"))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        for asked, transport, words in (
+            (motion, "tcp", "65 coils"),
+            (few, "tcp", "choose another port"),
+            (few, "usb", "tcp, pty, rfc2217"),
+        ):
+            with pytest.raises(InputError, match=words):
+                run_ndi(
+                    asked, FaultPlan(), transport=transport, host="127.0.0.1", port=port, announce=pytest.fail
+                )
+
+
+def test_the_command_line_starts_a_device_on_a_pseudo_terminal() -> None:
+    if sys.platform != "linux":
+        pytest.skip("pseudo-terminals are simulated ports on Linux alone")
+    serial = pytest.importorskip("serial")
+    program = "import sys; from tonguetrack.tracker.cli import main; sys.exit(main())"
+    command_line = [sys.executable, "-c", program, "simulate", "device", "ndi", "--synthetic", "--pty"]
+    with subprocess.Popen(command_line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert select.select([process.stdout], [], [], WAIT_S)[0], "the command says nothing"
+            uri = process.stdout.readline().strip()
+            assert uri.startswith("ndi:///dev/")
+            with serial.serial_for_url(uri.removeprefix("ndi://"), baudrate=9600, timeout=10.0) as port:
+                assert exchange(port, command("INIT")) == b"OKAYA896\r"
+                assert parse_reply(exchange(port, command("PHSR", "02"))) == "020A0010C001"
+            process.terminate()
+            assert process.wait(WAIT_S) == 0
+        finally:
+            process.kill()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ... import InputError
 from ..devices.ndi import (
     BAUD_CODES,
     OKAY,
@@ -146,7 +147,7 @@ class NdiDevice:
     nothing and does nothing.
 
     volume_mm: beyond it, along any axis, a tool is out of volume. realistic: answers take as long as a real
-    Aurora's. reset_s: how long a reset takes. now: the clock, s.
+    Aurora's. reset_s: how long a reset takes. now: the clock, s. Raises InputError for more than 64 coils.
     """
 
     def __init__(
@@ -161,7 +162,9 @@ class NdiDevice:
         now: Callable[[], float] = time.perf_counter,
     ) -> None:
         if len(motion.coils) > MAX_COILS:
-            raise ValueError(f"{len(motion.coils)} coils, where a device has up to {MAX_COILS}")
+            raise InputError(
+                f"{len(motion.coils)} coils: a simulated NDI device has up to {MAX_COILS}; choose fewer."
+            )
         self.model = MODELS[model]
         self.baud = POWER_ON_BAUD
         self._motion = motion
@@ -522,7 +525,8 @@ class NdiDevice:
         """The measurement that a reply is about; None before the first."""
         latest = self._latest()
         for number in range(max(self._newest + 1, latest - CATCH_UP + 1), latest + 1):
-            reports = self._misbehaviour.frames(self._motion.frame(number), self._streaming_s())
+            measured_s = self._streaming_s() - (latest - number) / self._motion.rate_hz
+            reports = self._misbehaviour.frames(self._motion.frame(number), measured_s)
             if reports:
                 self._repeats = deque(reports)
         self._newest = latest

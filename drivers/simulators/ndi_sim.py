@@ -71,7 +71,7 @@ def run_ndi(
     its state when clients come and go. model, volume_mm, realistic, reset_s: see `NdiDevice`. wire_time:
     whether bytes on a serial line take their time. log gets the bytes of every piece that the device understood.
 
-    Raises InputError where the port is taken or the platform has no pseudo-terminals.
+    Raises InputError where the port is taken, the platform has no pseudo-terminals, or there are too many coils.
     """
     if transport not in TRANSPORTS:
         raise InputError(f"'{transport}' is no transport; the transports are {', '.join(TRANSPORTS)}.")
@@ -93,13 +93,16 @@ def run_ndi(
                 readable, _, _ = select.select([listener], [], [], TICK_S)
                 if not readable:
                     continue
-                connection, _ = listener.accept()
-                with connection:
-                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    connection.settimeout(SEND_TIMEOUT_S)
-                    if not serial:
-                        device.connected()
-                    attendant.serve(TcpLine(connection) if transport == "tcp" else Rfc2217Line(connection))
+                with suppress(OSError, Hangup):  # a client may be gone before it is served
+                    connection, _ = listener.accept()
+                    with connection:
+                        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                        connection.settimeout(SEND_TIMEOUT_S)
+                        if not serial:
+                            device.connected()
+                        attendant.serve(
+                            TcpLine(connection) if transport == "tcp" else Rfc2217Line(connection)
+                        )
 
 
 @contextmanager
@@ -123,7 +126,8 @@ def _listening(host: str, port: int) -> Iterator[socket.socket]:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind((host, port))
             listener.listen(1)
-        except (OSError, OverflowError) as reason:
+            listener.setblocking(False)
+        except (OSError, UnicodeError, OverflowError) as reason:
             raise InputError(
                 f"{host}:{port}: {reason}; choose another port, or 0 for a free one."
             ) from reason
