@@ -20,7 +20,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tonguetrack import InputError
-from tonguetrack.drivers import CoilFrame, NoteKind, Recording
+from tonguetrack.drivers import CoilFrame, NoteKind, Recording, SourceNote
+from tonguetrack.drivers.devices import carstens_source
 from tonguetrack.drivers.devices.carstens_live import (
     LAYOUTS,
     LONGEST_LINE,
@@ -36,7 +37,8 @@ from tonguetrack.drivers.devices.carstens_live import (
     parse_block,
     parse_reply,
 )
-from tonguetrack.drivers.devices.carstens_source import open_carstens
+from tonguetrack.drivers.devices.carstens_source import CarstensConversation, open_carstens, shake_hands
+from tonguetrack.drivers.devices.link import LinkLost
 from tonguetrack.drivers.files.common import axes_from_angles, axes_from_quaternions
 from tonguetrack.drivers.simulators.carstens_sim import run_carstens
 from tonguetrack.drivers.simulators.faults import FaultPlan
@@ -308,6 +310,11 @@ def moving(name, jump=0, at=None):
     return answer
 
 
+@pytest.fixture(autouse=True)
+def a_quick_handshake(monkeypatch):
+    monkeypatch.setattr(carstens_source, "QUIET_S", 0.03)
+
+
 def items(source, count):
     return list(itertools.islice(source, count))
 
@@ -473,6 +480,56 @@ def test_a_device_that_sends_more_than_it_was_asked_for_is_connected_to_anew():
     assert notes(found, NoteKind.CONNECTED)
 
 
+class FakeLink:
+    """Gives pieces of bytes as they are, one a wait; at their end the connection closes."""
+
+    address = "nowhere:30303"
+
+    def __init__(self, pieces):
+        self.pieces = list(pieces)
+
+    def send(self, data):
+        pass
+
+    def receive(self, timeout_s):
+        if not self.pieces:
+            raise LinkLost("closed")
+        return self.pieces.pop(0)
+
+    def close(self):
+        pass
+
+
+PIECES = st.lists(
+    st.binary(max_size=40)
+    | st.integers(0, 50).map(lambda n: golden("ag500", [GOOD], word=n))
+    | st.integers(1, 959).map(lambda n: golden("ag500", [GOOD])[:n]),
+    max_size=12,
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(PIECES)
+def test_whatever_arrives_in_whatever_pieces_ends_in_a_lost_link_at_worst(pieces):
+    link = FakeLink(pieces)
+    conversation = CarstensConversation(link, layout_named("ag500"), 2000.0, 0.0, 0)
+    with pytest.raises(LinkLost):
+        for _ in range(1000):
+            item = conversation.receive(0.001)
+            assert item is None or isinstance(item, CoilFrame | SourceNote)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(st.binary(max_size=60) | st.sampled_from([b"200 Welcome\n", b"200-", bytes(960)]), max_size=8)
+)
+def test_whatever_answers_the_handshake_it_is_a_device_or_refused(pieces):
+    try:
+        assert shake_hands(FakeLink(pieces), "") in LAYOUTS
+    except (InputError, LinkLost):
+        pass
+
+
 # The simulator, in a process of its own ---------------------------------------------------------------
 
 SIMULATOR = """
@@ -574,7 +631,7 @@ def test_damaged_bytes_never_end_the_stream(simulated):
 
 
 def test_a_stall_is_silence_and_goes_on_by_itself(simulated):
-    with open_carstens(parse_source(simulated("stall=0.8@0.7"))) as source:
+    with open_carstens(parse_source(simulated("stall=0.8@0.4"))) as source:
         found = until(
             source, lambda found: notes(found, NoteKind.SILENT) and isinstance(found[-1], CoilFrame)
         )
@@ -582,13 +639,13 @@ def test_a_stall_is_silence_and_goes_on_by_itself(simulated):
 
 
 def test_a_device_that_does_not_answer_ten_times_is_lost_and_found_again(simulated):
-    with open_carstens(parse_source(simulated("stall=60@0.7"))) as source:
+    with open_carstens(parse_source(simulated("stall=60@0.4"))) as source:
         found = until(source, count_of(NoteKind.CONNECTED))
     assert "did not answer 10 times" in notes(found, NoteKind.DISCONNECTED)[0].text
 
 
 def test_a_cut_connection_is_mended(simulated):
-    with open_carstens(parse_source(simulated("disconnect@0.7"))) as source:
+    with open_carstens(parse_source(simulated("disconnect@0.4"))) as source:
         until(source, count_of(NoteKind.DISCONNECTED))
         until(source, count_of(NoteKind.CONNECTED))
         assert frames(until(source, lambda found: len(frames(found)) >= 5))
@@ -596,7 +653,7 @@ def test_a_cut_connection_is_mended(simulated):
 
 
 def test_a_jump_in_the_devices_count_is_told(simulated):
-    with open_carstens(parse_source(simulated("jump=30@0.7"))) as source:
+    with open_carstens(parse_source(simulated("jump=30@0.4"))) as source:
         found = until(
             source, lambda found: notes(found, NoteKind.CLOCK_RESET) and len(frames(found[-3:])) == 3
         )

@@ -25,8 +25,11 @@ from .source import DeviceSource
 
 WELCOME_S = 3.0
 REPLY_S = 0.2
-"""How long one reply is waited for, and how long a reply must pause to be whole while its size is unknown."""
 MOST_TRIES = 10
+FIRST_REPLY_S, FIRST_TRIES = 1.0, 3
+"""Before the size is known, two late replies in one would be taken for one that is twice as long."""
+QUIET_S = 0.2
+"""A reply of unknown size is whole when nothing follows for this long."""
 POLL_HZ = 250.0
 MOST_SAMPLES_A_SECOND = 2000.0
 """The fastest articulograph takes 1250; a counter that runs faster is damaged, or was set anew."""
@@ -186,7 +189,7 @@ def open_carstens(address: SourceAddress) -> DeviceSource:
     def connect() -> CarstensConversation:
         link = connect_tcp(address.host, address.port)
         try:
-            return CarstensConversation(link, _shake_hands(link, asked), poll_hz, rate_hz, start_ns)
+            return CarstensConversation(link, shake_hands(link, asked), poll_hz, rate_hz, start_ns)
         except BaseException:
             link.close()
             raise
@@ -194,7 +197,7 @@ def open_carstens(address: SourceAddress) -> DeviceSource:
     return DeviceSource(connect, address.text)
 
 
-def _shake_hands(link: Link, asked: str) -> Layout:
+def shake_hands(link: Link, asked: str) -> Layout:
     """Waits for the welcome and measures the blocks. Raises LinkLost, and InputError for what is no cs5recorder."""
     greeting = bytearray()
     deadline_s = time.perf_counter() + WELCOME_S
@@ -227,15 +230,17 @@ def _shake_hands(link: Link, asked: str) -> Layout:
 def _measured(link: Link, before: bytes = b"") -> bytes:
     """The answer to one `data`, read until the device is quiet. Raises LinkLost where none comes."""
     data = bytearray(before)
-    for _ in range(MOST_TRIES):
+    for _ in range(FIRST_TRIES):
         link.send(b"data\n")
-        while chunk := link.receive(REPLY_S):
+        chunk = link.receive(FIRST_REPLY_S)
+        while chunk:
             data += chunk
-            if len(data) > 2 * MOST_TRIES * LARGEST_BLOCK:
+            if len(data) > 2 * LARGEST_BLOCK:
                 raise InputError(f"{link.address} does not stop sending; is it cs5recorder?")
+            chunk = link.receive(QUIET_S)
         if data:
             return bytes(data)
-    raise LinkLost(f"{link.address} did not answer {MOST_TRIES} times")
+    raise LinkLost(f"{link.address} does not answer 'data'")
 
 
 def _near(before: int, counter: int, most: float) -> bool:

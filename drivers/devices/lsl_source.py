@@ -226,7 +226,7 @@ def _conversation(
 
 def _channels(info: Any) -> list[Channel]:
     """As many as the stream has; those that its description leaves out are without a label."""
-    channels = []
+    channels: list[Channel] = []
     node = info.desc().child("channels").child("channel")
     while not node.empty() and len(channels) < info.channel_count():
         channels.append(
