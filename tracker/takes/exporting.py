@@ -5,13 +5,17 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from ... import InputError
 from ...atomic import write_atomically
 from ...drivers.files.writing import WRITERS, write_recording
 from ...model.multilinear import TongueModel
-from ..posefiles import POSE_SUFFIXES, check_pose_suffix, write_poses
+from ..pose import FloatArray, TrackedPoses
+from ..posefiles import POSE_SUFFIXES, write_poses
 from .reading import Take
 
 SUFFIXES = {
@@ -33,15 +37,16 @@ def check_export(what: str, output: Path) -> None:
         )
 
 
-def export(take: Take, what: str, output: Path, model: Callable[[], TongueModel]) -> str:
+def export(take: Take, what: str, output: Path, model: Callable[[], TongueModel], model_path: str) -> str:
     """Writes one of SUFFIXES; a sentence that says what was written.
 
-    model: gives the model that the take belongs to; asked for poses only.
+    model, model_path: gives the model that the take belongs to, and where it is; asked for poses only. Where it
+    is another one, poses are written without its place, or not at all as .json.
     Raises InputError where the take has none of it, or `output` cannot be written.
     """
     check_export(what, output)
     if what == "poses":
-        return _poses(take, output, model())
+        return _poses(take, output, model(), model_path)
     if what == "session":
         row, text = take.sessions[-1]
         write_atomically(output, text.encode())
@@ -64,14 +69,29 @@ def markers_csv(take: Take) -> str:
     return out.getvalue()
 
 
-def _poses(take: Take, output: Path, model: TongueModel) -> str:
-    check_pose_suffix(output)
-    fingerprint = take.info.model_fingerprint
-    if output.suffix.lower() == ".json" and model.fingerprint != fingerprint:
+def _poses(take: Take, output: Path, model: TongueModel, model_path: str) -> str:
+    info, fingerprint = take.info, take.info.model_fingerprint
+    matches = (
+        model.fingerprint == fingerprint
+        and (len(info.pose_mean), info.speaker_size) == (model.pose.size, model.speaker.size)
+        and all(0 <= vertex < model.vertex_count for vertex in info.vertices)
+    )
+    if output.suffix.lower() == ".json" and not matches:
         raise InputError(
-            f"{take.path}: its poses belong to the model '{take.info.model_name}' [{fingerprint}], not to "
+            f"{take.path}: its poses belong to the model '{info.model_name}' [{fingerprint}], not to "
             f"'{model.name}' [{model.fingerprint}]; name that one with --model."
         )
-    poses = take.poses()
+    poses = replace(take.poses(), model_path=model_path if matches else "")
+    if matches:
+        poses = replace(poses, vertices=_fitted(poses, model))
     write_poses(poses, model, output)
     return f"{output}: {poses.frame_count} poses of {len(poses.roles)} coils"
+
+
+def _fitted(poses: TrackedPoses, model: TongueModel) -> FloatArray:
+    """(frames, n, 3) the model's points that the coils were fitted to, mm; a take does not keep them."""
+    points = model.at(poses.correspondences)
+    flat = points.origin + np.einsum(
+        "tl,tk,lkr->tr", poses.speaker_weights, poses.weights, points.core, optimize=True
+    )
+    return flat.reshape(poses.frame_count, -1, 3)
