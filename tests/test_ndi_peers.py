@@ -27,7 +27,8 @@ from tonguetrack.drivers.simulators.faults import FaultPlan
 from tonguetrack.drivers.simulators.motion import SimulatedMotion
 from tonguetrack.drivers.simulators.ndi_sim import run_ndi
 
-FRAMES, RATE_HZ = 400, 40.0
+RECORDING = str(Path(__file__).resolve().parents[1] / "recordings" / "demo.csv")
+FRAMES = 400
 WAIT_S = 30.0
 
 
@@ -84,7 +85,7 @@ class Simulator:
 def simulator(transport: str, coils: int = 4, **options: Any) -> Iterator[Simulator]:
     if transport == "pty" and sys.platform != "linux":
         pytest.skip("what clients flush shows in a pseudo-terminal's packet mode on Linux")
-    options = {"transport": transport, "wire_time": False, "reset_s": 0.02} | options
+    options = {"transport": transport, "reset_s": 0.02} | options
     process = subprocess.Popen(
         [sys.executable, "-c", DEVICE, json.dumps(options)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -343,7 +344,7 @@ def test_a_break_brings_the_device_back_to_9600_baud(transport: str) -> None:
 
 @pytest.mark.parametrize("transport", ["pty", "rfc2217"])
 def test_binary_replies_cross_a_serial_line_whole(transport: str) -> None:
-    with simulator(transport, wire_time=True) as device, open_port(device) as port:
+    with simulator(transport) as device, open_port(device) as port:
         exchange(port, command("INIT"))
         exchange(port, command("COMM", "60000"))
         port.baudrate = 921600
@@ -415,7 +416,7 @@ def test_the_command_line_starts_a_device_on_a_pseudo_terminal() -> None:
         pytest.skip("pseudo-terminals are simulated ports on Linux alone")
     serial = pytest.importorskip("serial")
     program = "import sys; from tonguetrack.tracker.cli import main; sys.exit(main())"
-    command_line = [sys.executable, "-c", program, "simulate", "device", "ndi", "--synthetic", "--pty"]
+    command_line = [sys.executable, "-c", program, "simulate", "device", "ndi", "--from", RECORDING, "--pty"]
     with subprocess.Popen(command_line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
