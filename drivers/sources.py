@@ -109,7 +109,7 @@ KINDS: tuple[SourceKind, ...] = (
         "Carstens AG500, AG501 (cs5recorder over TCP)",
         {
             "layout": "ag500, ag501, ag501-head, ag501-16, ag501-16-head (default: told by the size)",
-            "poll": "requests a second (default 250)",
+            "poll": "requests a second (default 500); twice the device's rate misses nothing",
             **_RATE,
         },
         "devices.carstens_source:open_carstens",

@@ -610,14 +610,14 @@ def test_samples_of_a_faster_device_are_skipped_without_an_error(simulated):
 
 
 def test_dropped_samples_are_a_gap(simulated):
-    with open_carstens(parse_source(simulated("drop=0.3") + "&poll=500")) as source:
+    with open_carstens(parse_source(simulated("drop=0.3"))) as source:
         found = until(source, lambda found: len(frames(found)) >= 100)
     assert sum(note.count for note in notes(found, NoteKind.GAP)) > 10
 
 
 @pytest.mark.parametrize("fault", ["duplicate=0.3", "reorder=0.3"])
 def test_doubled_and_reordered_samples_are_delivered_once_and_in_order(simulated, fault):
-    with open_carstens(parse_source(simulated(fault) + "&poll=500")) as source:
+    with open_carstens(parse_source(simulated(fault))) as source:
         found = frames(until(source, lambda found: len(frames(found)) >= 60))
     numbers = [frame.frame_number for frame in found]
     assert numbers == sorted(set(numbers))

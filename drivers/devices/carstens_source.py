@@ -30,7 +30,8 @@ FIRST_REPLY_S, FIRST_TRIES = 1.0, 3
 """Before the size is known, two late replies in one would be taken for one that is twice as long."""
 QUIET_S = 0.2
 """A reply of unknown size is whole when nothing follows for this long."""
-POLL_HZ = 250.0
+USUAL_HZ, POLL_HZ = 250.0, 500.0
+"""An AG501's usual rate; it is asked twice as often, or samples would be missed where the two rhythms meet."""
 MOST_SAMPLES_A_SECOND = 2000.0
 """The fastest articulograph takes 1250; a counter that runs faster is damaged, or was set anew."""
 CREDIBLE_JUMP, LATE_SAMPLES = 500, 50
@@ -49,7 +50,7 @@ class CarstensConversation:
 
     def __init__(self, link: Link, layout: Layout, poll_hz: float, rate_hz: float, start_ns: int) -> None:
         self.coils = coil_names(layout)
-        self.rate_hz = min(rate_hz, poll_hz) if rate_hz else poll_hz
+        self.rate_hz = min(rate_hz or USUAL_HZ, poll_hz)
         self.frame = FrameOfReference()
         self._link = link
         self._layout = layout
