@@ -309,9 +309,9 @@ def map_file(path: str | os.PathLike[str]) -> Buffer:
 def read_xdf(data: Buffer, name: str) -> XdfFile:
     """All streams of a file, up to its last whole chunk.
 
-    Where a chunk is damaged, reading goes on behind the next boundary. Streams keep views of `data`; numbers
-    are copied when they are asked for. Raises InputError where the file does not begin as XDF does; whatever
-    else is wrong is in `damage`.
+    Where a chunk is damaged, reading goes on behind it, or behind the next boundary if its length is damaged.
+    Streams keep views of `data`; numbers are copied when they are asked for. Raises InputError where the file
+    does not begin as XDF does; whatever else is wrong is in `damage`.
     """
     view = memoryview(data)
     if bytes(view[:4]) != MAGIC:
@@ -357,14 +357,14 @@ class _Reader:
             except _Damaged as reason:
                 if position > begin or not spans:
                     spans.append((begin, position))
-                found = _BOUNDARY_PATTERN.search(self._view, position)
-                if found is None:
+                after = self._next_whole(position)
+                if after is None:
                     how = "the file is cut off" if isinstance(reason, _CutOff) else "the rest is lost"
                     self._tell(f"{how} at byte {position} of {size} ({reason})")
                     begin = position = size
                     break
-                self._tell(f"the chunk at byte {position} is damaged ({reason}); read on from {found.end()}")
-                begin = position = found.end()
+                self._tell(f"the chunk at byte {position} is damaged ({reason}); read on from {after}")
+                begin = position = after
             else:
                 if tag <= STREAM_HEADER and position == self._headers_end:
                     self._headers_end = end
@@ -376,6 +376,20 @@ class _Reader:
         self._compare_with_footers()
         streams = [state.stream for state in self._states.values()]
         return XdfFile(streams, self._fields, size, spans, self._headers_end, self._footers, self._damages)
+
+    def _next_whole(self, position: int) -> int | None:
+        """Where to read on behind a damaged chunk: where its length says, if a chunk begins there, or else behind
+        the next boundary. None = nowhere.
+        """
+        try:
+            _, end = self._bounds(position)
+            start, _ = self._bounds(end)
+            if FILE_HEADER <= struct.unpack_from("<H", self._view, start)[0] <= STREAM_FOOTER:
+                return end
+        except _Damaged:
+            pass
+        found = _BOUNDARY_PATTERN.search(self._view, position)
+        return None if found is None else found.end()
 
     def _tell(self, sentence: str) -> None:
         if len(self._damages) < MAX_DAMAGES:
@@ -446,8 +460,8 @@ class _Reader:
         if end - start > MAX_XML_BYTES:
             raise _Damaged(f"{end - start} bytes of XML are too many")
         text = bytes(self._view[start:end]).decode("utf-8", "replace")
-        if "<!" in text:  # entities are declared behind it, and nothing of use to us
-            raise _Damaged("XML with declarations")
+        if "<!DOCTYPE" in text:  # nothing else can declare entities
+            raise _Damaged("XML with a document type")
         try:
             return ElementTree.fromstring(text)
         except (ElementTree.ParseError, ValueError) as reason:

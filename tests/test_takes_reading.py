@@ -307,16 +307,17 @@ def test_a_cut_take_says_so_in_the_recordings_notes(tmp_path):
 def test_behind_damage_frames_are_put_together_by_their_stamps(tmp_path):
     rows = rows_of(INFO, 90)
     parts = parts_of(INFO, rows)
-    broken = parts[3]  # the first ten frames of `prepared`; up to the boundary all else is lost with it
-    parts[3] = broken[:16] + b"\xff" + broken[17:]
+    parts[3] = parts[3][:16] + b"\xff" + parts[3][17:]  # the first ten rows of `prepared`
+    parts[5] = b"\7" + parts[5][1:]  # `raw` of the next ten, and all up to the boundary
     take = read_take(written(tmp_path / "a.xdf", parts))
-    assert take.state == "damaged" and "is damaged" in take.damage
-    assert take.frame_count == 70  # raw 1 to 10, then everything from 31
-    assert np.isnan(take.prepared[:10]).all() and np.isnan(take.pose[:10]).all()
+    assert take.state == "damaged" and take.damage.count("is damaged") == 2
+    assert take.frame_count == 70
+    assert np.isnan(take.prepared[:10]).all()
     for name in NUMBERS:
         assert getattr(take, name)[10:].tobytes() == np.ascontiguousarray(rows[name][30:]).tobytes()
     assert take.raw[:10].tobytes() == np.ascontiguousarray(rows["raw"][:10]).tobytes()
-    assert take.poses().frame_count == 60
+    assert take.pose[:10].tobytes() == np.ascontiguousarray(rows["pose"][:10]).tobytes()
+    assert take.poses().frame_count == 70
 
 
 PLACES = st.integers(0, 2**31)

@@ -245,20 +245,42 @@ def test_cut_at_any_byte_everything_up_to_the_last_whole_chunk_is_read():
             assert f"cut off at byte {file.whole_bytes} of {cut}" in file.damage
 
 
-def test_behind_a_damaged_chunk_reading_goes_on_at_the_next_boundary():
-    parts = small_file()
-    place = sum(map(len, parts[:5])) + 20
+def damaged_from(parts, which, offset, value):
+    """The file with one byte of one part changed, and where that part begins."""
+    begin = sum(map(len, parts[:which]))
     data = bytearray(b"".join(parts))
-    data[place - 4] = 99  # the number of samples
-    file = read_xdf(bytes(data), "f")
-    stream = file.streams[0]
-    np.testing.assert_array_equal(stream.values, np.concatenate([ramp(5)[1], ramp(5)[1] + 2]))
-    begin = sum(map(len, parts[:5]))
-    after = sum(map(len, parts[:7]))
+    data[begin + offset] = value
+    return bytes(data), begin
+
+
+def test_a_chunk_with_damaged_content_is_left_out():
+    parts = small_file()
+    data, begin = damaged_from(parts, 5, 16, 99)  # how many bytes the first stamp has
+    file = read_xdf(data, "f")
+    np.testing.assert_array_equal(file.streams[0].values, np.concatenate([ramp(5)[1], ramp(5)[1] + 2]))
+    after = begin + len(parts[5])
     assert file.spans == [(4, begin), (after, len(data))]
     assert f"byte {begin} is damaged" in file.damage and f"read on from {after}" in file.damage
     assert "has 10 of 15 samples" in file.damage
     assert not file.only_cut_off
+
+
+@pytest.mark.parametrize(("offset", "value"), [(0, 3), (1, 0x11), (2, 0xFF), (4, 0xFF)])
+def test_behind_a_chunk_with_a_damaged_length_reading_goes_on_at_the_next_boundary(offset, value):
+    parts = small_file()
+    data, begin = damaged_from(parts, 5, offset, value)
+    file = read_xdf(data, "f")
+    np.testing.assert_array_equal(file.streams[0].values, np.concatenate([ramp(5)[1], ramp(5)[1] + 2]))
+    after = begin + len(parts[5]) + len(boundary())
+    assert file.spans == [(4, begin), (after, len(data))]
+    assert f"read on from {after}" in file.damage
+
+
+def test_garbage_at_the_end_costs_nothing_before_it():
+    data = b"".join(small_file())
+    file = read_xdf(data + b"\7garbage", "f")
+    assert file.streams[0].count == 15 and file.whole_bytes == len(data)
+    assert "the rest is lost" in file.damage and file.only_cut_off
 
 
 def test_samples_of_a_stream_whose_header_is_lost_are_told_and_the_rest_is_read():
@@ -277,7 +299,7 @@ BOMB = b"<!DOCTYPE a [<!ENTITY b 'bbbbbbbb'><!ENTITY c '&b;&b;&b;&b;'>]><info><n
 @pytest.mark.parametrize(
     ("content", "why"),
     [
-        (struct.pack("<I", 3) + BOMB, "declarations"),
+        (struct.pack("<I", 3) + BOMB, "document type"),
         (struct.pack("<I", 3) + b"<info><name>", "cannot be read"),
         (struct.pack("<I", 3) + b"<info></info>", "channel format ''"),
         (struct.pack("<I", 3) + BOMB.decode().encode("utf-16"), "cannot be read"),
@@ -288,6 +310,13 @@ def test_a_header_that_is_none_is_damage_and_not_an_exception(content, why):
     file = read_xdf(file_header({}) + chunk(2, content) + boundary() + header(), "f")
     assert why in file.damage
     assert [stream.name for stream in file.streams] == ["coils"]
+
+
+def test_comments_and_plain_sections_in_a_header_are_xml_like_any_other():
+    xml = b"<info><!-- made by hand --><name><![CDATA[a<b]]></name><channel_count>1</channel_count>"
+    xml += b"<channel_format>int8</channel_format></info>"
+    file = read_xdf(file_header({}) + chunk(2, struct.pack("<I", 3) + xml), "f")
+    assert file.damage is None and file.streams[0].name == "a<b"
 
 
 @pytest.mark.parametrize("channels", ["0", "-1", "99999999999", "1e3", "", "٣"])
