@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -344,6 +345,12 @@ def test_the_first_note_says_that_the_driver_never_met_the_hardware():
     assert "never tried against the hardware" in first.text and "ag501" in first.text
 
 
+def test_a_run_that_begins_after_a_long_preparation_is_told_what_was_said_on_connecting():
+    with Scripted(moving("ag500")) as device, open_carstens(parse_source(device.address)) as source:
+        source.catch_up()
+        assert "never tried" in notes(items(source, 2), NoteKind.INFO)[0].text
+
+
 def test_the_device_is_told_goodbye():
     with Scripted(moving("ag500")) as device:
         open_carstens(parse_source(device.address)).close()
@@ -498,6 +505,21 @@ class FakeLink:
 
     def close(self):
         pass
+
+
+def test_a_reader_that_was_kept_busy_finds_its_reply_and_does_not_ask_again(monkeypatch):
+    asked = []
+    monkeypatch.setattr(FakeLink, "send", lambda link, data: asked.append(data))
+    clock = SimpleNamespace(now_s=0.0)
+    fake = SimpleNamespace(perf_counter=lambda: clock.now_s, perf_counter_ns=lambda: int(clock.now_s * 1e9))
+    monkeypatch.setattr(carstens_source, "time", fake)
+    link = FakeLink([b"", golden("ag500", [GOOD], word=1)])
+    conversation = CarstensConversation(link, layout_named("ag500"), 500.0, 0.0, 0)
+    assert conversation.receive(0.0).kind is NoteKind.INFO
+    assert conversation.receive(0.0) is None
+    clock.now_s = 10.0
+    assert conversation.receive(0.0).frame_number == 1
+    assert asked == [b"data\n"]
 
 
 PIECES = st.lists(

@@ -82,22 +82,19 @@ class CarstensConversation:
                 self._take()
                 continue
             now_s = time.perf_counter()
-            if self._asked_s is None:
-                until_s = self._next_s
-                if now_s >= until_s:
-                    self._ask(now_s)
-                    continue
-            else:
-                until_s = self._asked_s + REPLY_S
-                if now_s >= until_s:
-                    self._ask_again(now_s)
-                    continue
-            if now_s >= end_s:
-                return None
-            data = self._link.receive(min(until_s, end_s) - now_s)
+            if self._asked_s is None and now_s >= self._next_s:
+                self._ask(now_s)
+            until_s = self._next_s if self._asked_s is None else self._asked_s + REPLY_S
+            # Read before judging: a reader that was kept busy finds its reply, however late it looks.
+            data = self._link.receive(max(0.0, min(until_s, end_s) - now_s))
             if data and not self._unanswered:
                 raise LinkLost(f"{self._link.address} sends more than was asked for")
             self._buffer += data
+            now_s = time.perf_counter()
+            if not data and self._asked_s is not None and now_s >= until_s:
+                self._ask_again(now_s)
+            elif not data and now_s >= end_s:
+                return None
 
     def goodbye(self) -> None:
         try:

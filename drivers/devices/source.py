@@ -115,13 +115,16 @@ class DeviceSource:
             conversation.goodbye()
 
     def catch_up(self) -> None:
-        """Leaves out what came while nobody read, so that the next frame is a fresh one."""
+        """Leaves out frames that came while nobody read, so that the next one is fresh. Notes are kept."""
         deadline_s = time.perf_counter() + CATCH_UP_S
         self._queue.clear()
         try:
             while self._conversation is not None and time.perf_counter() < deadline_s:
-                if self._conversation.receive(0.0) is None:
+                item = self._conversation.receive(0.0)
+                if item is None:
                     break
+                if isinstance(item, SourceNote):
+                    self._queue.append(item)
         except LinkLost as reason:
             self._queue.append(self._lose(str(reason)))
         self._clock.restart()
