@@ -127,7 +127,7 @@ def take_recording(
     frames, coils = len(stamps), len(head.coils)
     clock, places, *rest = (columns(range(begin, end)) for begin, end in pairwise(begins))
     positions = places.reshape(frames, coils, 3)
-    times, rate_hz, notes = _take_times(stamps, head.rate_hz, name, asked_hz)
+    times, rate_hz, notes = take_times(stamps, head.rate_hz, name, asked_hz)
     return Recording(
         coils=head.coils,
         positions=positions,
@@ -157,10 +157,14 @@ def _whole_numbers(values: FloatArray) -> np.ndarray:
     return np.where(np.abs(values) <= _EXACT, values, -1).astype(np.int64)
 
 
-def _take_times(
-    stamps: FloatArray, nominal_hz: float, name: str, asked_hz: float | None
+def take_times(
+    stamps: FloatArray, nominal_hz: float, name: str, asked_hz: float | None = None
 ) -> tuple[FloatArray, float, list[str]]:
-    """Seconds since the first frame's arrival, strictly increasing, the rate, and notes."""
+    """Of a take's frames: s since the first one's arrival, strictly increasing, the rate in Hz, and notes.
+
+    stamps: (frames,) arrivals, s. nominal_hz: 0.0 = unknown; asked_hz: the user's --rate.
+    Raises InputError where nothing tells the rate.
+    """
     usual_hz = asked_hz or nominal_hz
     with np.errstate(invalid="ignore", over="ignore"):
         times = stamps - stamps[0]

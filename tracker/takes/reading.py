@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ... import InputError
 from ...drivers.files.recognise import read_head
-from ...drivers.files.xdf import TakeHead, is_xdf, take_recording
+from ...drivers.files.xdf import TakeHead, is_xdf, take_recording, take_times
 from ...drivers.frames import CoilFrame, Recording
 from ...drivers.xdf import XdfFile, XdfStream, map_file, read_xdf
 from ..pose import FloatArray, PoseStatus, TrackedPoses
@@ -198,15 +198,17 @@ class Take:
 
     def prepared_recording(self) -> Recording:
         """The tracked coils in the model's frame."""
-        whole = self.recording()
+        self._check_frames()
+        times, rate_hz, notes = take_times(self.stamps, self.info.rate_hz, str(self.path))
         return Recording(
             coils=self.info.roles,
             positions=self.prepared.reshape(self.frame_count, -1, 3),
-            times_s=whole.times_s,
-            rate_hz=whole.rate_hz,
-            format=f"prepared coils of a {whole.format}",
+            times_s=times,
+            rate_hz=rate_hz,
+            format="prepared coils of a tonguetrack take",
             frame=MODEL_FRAME,
             source=str(self.path),
+            notes=tuple(notes),
         )
 
     def poses(self) -> TrackedPoses:
@@ -220,12 +222,12 @@ class Take:
         there = np.isin(status, [int(known) for known in PoseStatus])
         if not there.any():
             raise InputError(f"{self.path}: the take has no poses.")
-        recording = self.recording()
+        times, rate_hz, _ = take_times(self.stamps, info.rate_hz, str(self.path))
         widths = [len(POSE_HEAD), len(info.pose_mean), info.speaker_size, len(info.roles)]
         head, weights, speakers, residuals, _ = np.split(pose[there], np.cumsum(widths), axis=1)
         values = dict(zip(POSE_HEAD, head.T, strict=True))
         return TrackedPoses(
-            times_s=recording.times_s[there],
+            times_s=times[there],
             statuses=values["status"].astype(np.int64),
             weights=weights,
             normalised=(weights - info.pose_mean) / info.pose_sigma,
@@ -238,7 +240,7 @@ class Take:
             roles=info.roles,
             correspondences=info.vertices,
             experiment=2 if bool(values["speaker_fixed"].all()) else 1,
-            rate_hz=recording.rate_hz,
+            rate_hz=rate_hz,
             model_fingerprint=info.model_fingerprint,
             model_name=info.model_name,
             recording=str(self.path),
