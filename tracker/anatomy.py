@@ -17,6 +17,7 @@ positive definite; each step is shortened until f falls. Time and memory grow wi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -32,11 +33,15 @@ from .session import Energy
 RELATIVE_DECREASE = 1e-11  # a step that promises less of f than this is not taken
 MAX_STEPS = 200  # each descent of ordinary speech takes 3 to 10
 SHORTEST_STEP = 1e-9
+EXACT, GAUSS_NEWTON, POSES_HELD = 0, 1, 2
 
 REWEIGHTINGS = 3
 # The distance at which a sample's weight is 1/2, in medians of all samples' distances. On speakers whom the model had
 # never seen, 5 costs clean speech nothing measurable, and samples 50 mm astray no longer tell; 3 costs a little.
 OUTLIER_MEDIANS = 5.0
+
+# With a smaller share of the coordinates left over, the poses follow the coils wherever they are.
+LEAST_SPARE = 0.01
 
 # Without a bias, weights that no coil determines still need one value: this share of the data's curvature
 # draws them to their mean, which no determined weight notices.
@@ -63,8 +68,9 @@ class SpeakerEstimate:
 
     weights: (m,) raw speaker weights.
     covariance: (m, m) of the weights: the inverse of the reduced Hessian, scaled by the variance of the residuals.
-        It takes the samples' errors for independent and ignores the box; what the model cannot express at all is
-        no such error, so a real speaker is farther off than this.
+        It takes the samples' errors for independent, and knows neither of the box nor of what the biases draw the
+        estimate away by. What the model cannot express is no such error: a real speaker is farther off than this.
+        Infinite where too few coils are there to contradict the poses.
     sigma: (m,) the square roots of its diagonal, in units of the model's speaker sigma.
     frames: how many frames with a coil it comes from.
     residual_mm: mean distance between coils and vertices, over all samples.
@@ -82,7 +88,8 @@ class SpeakerEstimate:
 
 class Problem(NamedTuple):
     """What is minimised. coils (T, n, 3) mm; base (3n,), core (m, k, 3n) mm at the coils' vertices;
-    speaker_box (3, m), pose_box (3, k): rows mean, low, high; terms (3,): alpha, beta_p, T_eff beta_s."""
+    speaker_box (3, m), pose_box (3, k): rows mean, low, high; terms (3,): alpha, beta_p, T_eff beta_s; flips (4, m):
+    the signs of `sign_flips`."""
 
     coils: FloatArray
     base: FloatArray
@@ -90,6 +97,7 @@ class Problem(NamedTuple):
     speaker_box: FloatArray
     pose_box: FloatArray
     terms: FloatArray
+    flips: FloatArray
 
 
 class State(NamedTuple):
@@ -103,8 +111,8 @@ class State(NamedTuple):
 class Work(NamedTuple):
     """Work space, made once. directions (k, 3n) and gram (n, k, k) belong to the current speaker; of one frame:
     residual (3n,), slopes (m, 3n) d v / d s, cross (m, k), pose_hessian (k, k), pose_linear (k,), eliminated
-    (k, m + k); of the reduced system: gradient, linear, target, before (m,), hessian (m, m); ends (2, m): the other start and
-    the better end; distances (T, n) mm.
+    (k, m + k); of the reduced system: gradient, linear, target, before (m,), hessian (m, m); ends (2, m): the start and
+    the best end; distances (T, n) mm.
     """
 
     directions: FloatArray
@@ -128,7 +136,7 @@ class Work(NamedTuple):
 
 class Outcome(NamedTuple):
     """energy: F at the end; residual_mm: mean distance over all samples; frames: those with a coil; variance: of
-    one coordinate's residual, in units of F; steps; at_rest: whether the last descent ended at a minimum."""
+    one coordinate's residual, in units of F, infinite where there are no more coordinates than weights; steps; at_rest: whether the last descent ended at a minimum."""
 
     energy: float
     residual_mm: float
@@ -177,11 +185,8 @@ def _set_residual(problem: Problem, state: State, work: Work, frame: int) -> Non
 
 
 @njit(**OPTIONS)
-def solve_poses(problem: Problem, state: State, work: Work) -> float:
-    """The best pose of every frame for the state's speaker, and the distances there. Returns f.
-
-    NaN or infinite where the coils are too far away for float64.
-    """
+def _set_directions(problem: Problem, state: State, work: Work) -> None:
+    """d v / d p for the state's speaker."""
     speakers, size, rows = problem.core.shape
     for k in range(size):
         for row in range(rows):
@@ -189,6 +194,13 @@ def solve_poses(problem: Problem, state: State, work: Work) -> float:
             for l in range(speakers):
                 total += state.speaker[l] * problem.core[l, k, row]
             work.directions[k, row] = total
+
+
+@njit(**OPTIONS)
+def solve_poses(problem: Problem, state: State, work: Work) -> float:
+    """The best pose of every frame for the state's speaker, and the distances there. Returns f."""
+    speakers, size, _ = problem.core.shape
+    _set_directions(problem, state, work)
     coil_grams(work.directions, work.gram)
     energy = 0.0
     for l in range(speakers):
@@ -234,11 +246,12 @@ def solve_poses(problem: Problem, state: State, work: Work) -> float:
 
 
 @njit(**OPTIONS)
-def reduce_to_speaker(problem: Problem, state: State, work: Work, exact: bool) -> float:
+def reduce_to_speaker(problem: Problem, state: State, work: Work, kind: int) -> float:
     """Half the gradient and half the Hessian of f at the state, whose poses must be solved.
 
-    exact: with the bilinear term of the Hessian; else Gauss-Newton's, which is never indefinite. Returns how
-    many weights of the poses the coils determine: one each that the data hold, none each that the bias holds.
+    kind: EXACT; GAUSS_NEWTON, without the bilinear term, never indefinite; POSES_HELD, those of F(., p) with the
+    poses where they are, which is quadratic. Returns how many weights of the poses the coils determine: one each
+    that the data hold, none each that the bias or nothing holds.
     """
     speakers, size, rows = problem.core.shape
     determined = 0.0
@@ -252,7 +265,8 @@ def reduce_to_speaker(problem: Problem, state: State, work: Work, exact: bool) -
         if present == 0:
             continue
         share = problem.terms[0] / present
-        _set_pose_hessian(problem, state, work, frame, share)
+        if kind != POSES_HELD:
+            _set_pose_hessian(problem, state, work, frame, share)
         _set_residual(problem, state, work, frame)
         for l in range(speakers):
             for row in range(rows):
@@ -268,7 +282,7 @@ def reduce_to_speaker(problem: Problem, state: State, work: Work, exact: bool) -
             factor = share * state.trust[frame, i]
             for row in range(3 * i, 3 * i + 3):
                 pull = factor * work.residual[row]
-                bend = pull if exact else 0.0
+                bend = pull if kind == EXACT else 0.0
                 for l in range(speakers):
                     slope = factor * work.slopes[l, row]
                     work.gradient[l] += pull * work.slopes[l, row]
@@ -276,7 +290,8 @@ def reduce_to_speaker(problem: Problem, state: State, work: Work, exact: bool) -
                         work.hessian[l, b] += slope * work.slopes[b, row]
                     for k in range(size):
                         work.cross[l, k] += slope * work.directions[k, row] + bend * problem.core[l, k, row]
-        determined += _eliminate_pose(problem, state, work, frame)
+        if kind != POSES_HELD:
+            determined += _eliminate_pose(problem, state, work, frame)
     for a in range(speakers):
         for b in range(a):
             work.hessian[b, a] = work.hessian[a, b]
@@ -369,10 +384,10 @@ def _descend(problem: Problem, state: State, work: Work) -> tuple[float, int, bo
         state.speaker[l] = min(max(state.speaker[l], problem.speaker_box[1, l]), problem.speaker_box[2, l])
     energy = solve_poses(problem, state, work)
     for step in range(MAX_STEPS):
-        reduce_to_speaker(problem, state, work, True)
+        reduce_to_speaker(problem, state, work, EXACT)
         promised = _set_target(problem, state, work)
         if promised < 0.0:
-            reduce_to_speaker(problem, state, work, False)
+            reduce_to_speaker(problem, state, work, GAUSS_NEWTON)
             promised = _set_target(problem, state, work)
         if not promised > RELATIVE_DECREASE * energy:
             return energy, step, np.isfinite(energy)
@@ -432,11 +447,31 @@ def _reweigh(state: State, work: Work) -> None:
             state.trust[frame, i] = 0.0 if np.isnan(ratio) else 1.0 / (falling * falling)
 
 
+@njit(**OPTIONS)
+def _start_from(attempt: int, problem: Problem, state: State, work: Work) -> None:
+    """Sets the poses to the mean, and the speaker to the start (attempt 0), or else to the one who explains the coils
+    best with the mean pose in every frame, its signs changed as the attempt's row of flips has it."""
+    for frame in range(state.poses.shape[0]):
+        for k in range(state.poses.shape[1]):
+            state.poses[frame, k] = problem.pose_box[0, k]
+    for l in range(state.speaker.shape[0]):
+        low, high = problem.speaker_box[1, l], problem.speaker_box[2, l]
+        state.speaker[l] = min(max(work.ends[0, l], low), high)
+    if attempt > 0:
+        _set_directions(problem, state, work)
+        reduce_to_speaker(problem, state, work, POSES_HELD)
+        if _set_target(problem, state, work) > 0.0:
+            for l in range(state.speaker.shape[0]):
+                state.speaker[l] = problem.flips[attempt - 1, l] * work.target[l]
+
+
 @njit(nogil=True, **OPTIONS)
-def estimate(problem: Problem, state: State, work: Work, mirror: bool, reweightings: int) -> Outcome:
+def estimate(problem: Problem, state: State, work: Work, first: bool, reweightings: int) -> Outcome:
     """From the state's speaker to the best one, in place, without the interpreter's lock.
 
-    mirror: also descend from the mirrored start, as v(s, p) = v(-s, -p), and keep the better end.
+    F has several minima, because signs can change in pairs (`sign_flips`). It descends from the start and from the
+    speaker of the mean pose (`_start_from`), where no sign has changed; the first time from its flips too. The
+    lowest end is kept.
     reweightings: how often the trust is taken anew from the distances, and f minimised again. Leaves half the
     Gauss-Newton Hessian of f in work.hessian.
     """
@@ -444,28 +479,27 @@ def estimate(problem: Problem, state: State, work: Work, mirror: bool, reweighti
     for frame in range(state.trust.shape[0]):
         for i in range(state.trust.shape[1]):
             state.trust[frame, i] = 1.0
-        for k in range(state.poses.shape[1]):
-            state.poses[frame, k] = problem.pose_box[0, k]
     for l in range(speakers):
-        work.ends[0, l] = -state.speaker[l]
-    energy, steps, at_rest = _descend(problem, state, work)
-    if mirror:
-        for l in range(speakers):
-            work.ends[1, l] = state.speaker[l]
-            state.speaker[l] = work.ends[0, l]
-        other_energy, more, other_at_rest = _descend(problem, state, work)
+        work.ends[0, l] = state.speaker[l]
+    lowest = np.inf
+    steps = 0
+    for attempt in range(1 + (problem.flips.shape[0] if first else 1)):
+        _start_from(attempt, problem, state, work)
+        energy, more, at_rest = _descend(problem, state, work)
         steps += more
-        if other_energy < energy * (1.0 - 1e-9):
-            energy, at_rest = other_energy, other_at_rest
-        else:
+        if attempt == 0 or energy < lowest * (1.0 - 1e-9):
+            lowest = energy
             for l in range(speakers):
-                state.speaker[l] = work.ends[1, l]
-            energy = solve_poses(problem, state, work)
+                work.ends[1, l] = state.speaker[l]
+    for l in range(speakers):
+        state.speaker[l] = work.ends[1, l]
+    energy, more, at_rest = _descend(problem, state, work)
+    steps += more
     for _ in range(reweightings):
         _reweigh(state, work)
         energy, more, at_rest = _descend(problem, state, work)
         steps += more
-    determined = reduce_to_speaker(problem, state, work, False) + speakers
+    determined = reduce_to_speaker(problem, state, work, GAUSS_NEWTON) + speakers
     frames = 0
     samples = 0
     distance = 0.0
@@ -483,8 +517,22 @@ def estimate(problem: Problem, state: State, work: Work, mirror: bool, reweighti
             squared += problem.terms[0] / present * trust * work.distances[frame, i] ** 2
             # Coils projected into the mid-sagittal plane measure nothing across it.
             coordinates += trust * (2.0 if problem.coils[frame, i, 0] == 0.0 else 3.0)
-    variance = squared / max(coordinates - determined, 1.0)
+    spare = coordinates - determined
+    variance = squared / spare if spare >= LEAST_SPARE * coordinates else np.inf
     return Outcome(energy, distance / samples, frames, variance, steps, at_rest)
+
+
+def sign_flips(model: TongueModel) -> FloatArray:
+    """(4, m) signs of speaker weights that nearly the same shapes are found behind: none changed, all, those of the
+    weights that carry the mean, those of the others.
+
+    v(s, p) = v(-s, -p) exactly. And of both modes about one weight is far from 0 in everybody, as it carries the mean
+    of the data; with its sign and those of the others in the other mode changed, or the reverse, all that
+    distinguishes is how speaker and pose interact.
+    """
+    carries = np.where(np.abs(model.speaker.mean) > 0.5 * model.speaker.sigma, -1.0, 1.0)
+    same = np.ones(model.speaker.size)
+    return np.stack([same, -same, carries, -carries])
 
 
 class SpeakerEstimator:
@@ -504,6 +552,7 @@ class SpeakerEstimator:
             np.stack([mode.mean, mode.mean - energy.box * mode.sigma, mode.mean + energy.box * mode.sigma])
             for mode in (model.speaker, model.pose)
         )
+        self._flips = sign_flips(model)
         self._energy = energy
         self._smallest_bias = SMALLEST_BIAS * energy.alpha * float(np.mean(model.core**2)) + 1e-300
         self._speaker = np.array(model.speaker.mean)
@@ -546,13 +595,15 @@ class SpeakerEstimator:
         )
         terms = np.array([self._energy.alpha, bias_pose, bias_frames(tracked) * bias_speaker])
         self.outcome = estimate(
-            Problem(coils, self._base, self._core, *self._boxes, terms),
+            Problem(coils, self._base, self._core, *self._boxes, terms, self._flips),
             State(self._speaker, self.poses[:frames], self.trust[:frames]),
             self._work._replace(distances=self._distances[:frames]),
             start is None,
             REWEIGHTINGS if robust else 0,
         )
-        covariance = self.outcome.variance * np.linalg.inv(self._work.hessian)
+        covariance = np.full(self._work.hessian.shape, np.inf)
+        if math.isfinite(self.outcome.variance):
+            covariance = self.outcome.variance * np.linalg.inv(self._work.hessian)
         return SpeakerEstimate(
             weights=self._speaker.copy(),
             covariance=covariance,
@@ -577,8 +628,7 @@ def estimate_speaker(
     model_at_coils: the multilinear model at the coils' vertices, in the coils' order (`TongueModel.at`).
     energy: alpha, beta_speaker (counted once a frame: `bias_frames`), beta_pose and box; gamma plays no part.
     coils: mm in the model frame, NaN = missing. Frames without any coil count for nothing.
-    start: (m,) raw speaker weights to begin at, as those of an earlier estimate; None begins at the mean and at
-    its mirror, and keeps the better end.
+    start: (m,) raw speaker weights to begin at, as those of an earlier estimate; None begins at the mean.
     robust: REWEIGHTINGS times, samples far outside the others' distances lose their weight (Geman-McClure) and F
     is minimised again; False weighs all alike.
 

@@ -50,7 +50,12 @@ def mean_speaker(at_coils: TongueModel, coils: FloatArray) -> FloatArray:
 
 
 def mean_of_frames(at_coils: TongueModel, coils: FloatArray) -> FloatArray:
-    return FreeSpeakerSolver(at_coils, Energy()).solve_all(coils).weights[:, : at_coils.speaker.size].mean(axis=0)
+    return (
+        FreeSpeakerSolver(at_coils, Energy())
+        .solve_all(coils)
+        .weights[:, : at_coils.speaker.size]
+        .mean(axis=0)
+    )
 
 
 def joint(at_coils: TongueModel, coils: FloatArray) -> FloatArray:
@@ -132,7 +137,9 @@ def main() -> None:
     parser.add_argument("--region")
     args = parser.parse_args()
     region = json.loads(Path(args.region).read_text())["indices"] if args.region else None
-    errors: dict[tuple[str, str], list[tuple[float, ...]]] = defaultdict(list)  # a value per part in every fold
+    errors: dict[tuple[str, str], list[tuple[float, ...]]] = defaultdict(
+        list
+    )  # a value per part in every fold
     for fold, (model, truth) in enumerate(folds(load_training_shapes(read_sample_database(args.database)))):
         for row, values in fold_errors(model, truth, args.coils, args.noise, region, fold).items():
             errors[row].append(values)
