@@ -667,6 +667,11 @@ class ReplyReader:
         """Whether bytes have come that `next` has not given out yet."""
         return bool(self._buffer or self._ready) or self._bad > 0
 
+    @property
+    def damaged(self) -> bool:
+        """Whether the pending bytes begin with some that belong to no reply: only where they end is not known."""
+        return self._bad > 0
+
     def clear(self) -> int:
         """Forgets everything that has come; returns how many bytes that was."""
         size = len(self._buffer) + self._bad

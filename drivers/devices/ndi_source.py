@@ -30,6 +30,8 @@ SPEED_PAUSE_S = 0.1
 POLL_TIMEOUT_S = 1.0
 QUIET_S = 0.25
 """A reply that has begun and does not go on for this long has lost some of its bytes."""
+DAMAGED_QUIET_S = 0.05
+"""The same for one that is known to be damaged."""
 TRIES = 3
 BAD_IN_A_ROW = 5
 GOODBYE_TIMEOUT_S = 0.8
@@ -386,7 +388,7 @@ class NdiConversation:
                     return frame
             elif isinstance(item, ndi.Damage):
                 self._asked = False
-                self._count_bad(f"{item.size} bytes that are no reply")
+                self._count_bad(f"{item.size} bytes that are no whole reply")
             elif not self._listen(deadline):
                 return None
 
@@ -417,7 +419,9 @@ class NdiConversation:
     def _listen(self, deadline: float) -> bool:
         """Takes in what comes; False when nothing came until the deadline."""
         now = time.perf_counter()
-        ends_s = self._heard_s + QUIET_S if self._reader.pending else self._asked_s + POLL_TIMEOUT_S
+        ends_s = self._asked_s + POLL_TIMEOUT_S
+        if self._reader.pending:
+            ends_s = self._heard_s + (DAMAGED_QUIET_S if self._reader.damaged else QUIET_S)
         data = self._link.receive(max(0.0, min(deadline, ends_s) - now))
         if data:
             self._feed(data)
@@ -426,7 +430,7 @@ class NdiConversation:
         if now >= ends_s:
             self._asked = False
             if self._reader.pending:
-                self._count_bad(f"a reply that ends after {self._reader.clear()} bytes")
+                self._count_bad(f"{self._reader.clear()} bytes that are no whole reply")
                 return True
         return now < deadline
 

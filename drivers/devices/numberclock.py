@@ -13,8 +13,9 @@ CATCH_UP_S = 4.0
 """An offset is worked off in about this time ..."""
 PACE_LIMIT = 0.01
 """... but never by running faster or slower than by this share."""
-JUMP_S = 0.25
-"""A frame that arrives earlier than its number allows by more belongs to a counter that jumped."""
+EARLY_S, LATE_S = 0.1, 0.25
+"""A frame that arrives earlier than its number allows by more belongs to a counter that jumped ahead; a whole
+section that arrives later by more, to one that fell back."""
 BASELINE_SECTIONS = 64
 
 
@@ -83,12 +84,12 @@ class NumberClock:
     def _follow(self, number: int, arrival_s: float) -> float:
         time_s = self._base[1] + (number - self._base[0]) * self._pace_s
         late_s = arrival_s - time_s
-        if late_s < -JUMP_S:
+        if late_s < -EARLY_S:
             return self._anchor(number, arrival_s)
         if self._best is None or late_s < self._best[0]:
             self._best = (late_s, number, arrival_s)
         if arrival_s - self._section_from_s >= SECTION_S:
-            if self._best[0] > JUMP_S:  # not one frame of the section fits: the count itself fell back
+            if self._best[0] > LATE_S:  # not one frame of the section fits: the count itself fell back
                 return self._anchor(number, arrival_s)
             self._end_section(self._best, number, time_s, arrival_s)
         return time_s
