@@ -254,6 +254,26 @@ def test_closing_again_changes_nothing_and_later_frames_are_counted(tmp_path):
     assert os.listdir(tmp_path) == ["take.xdf"]
 
 
+def test_a_frame_that_is_on_its_way_when_the_take_ends_is_still_in_it(tmp_path):
+    recorder = opened(tmp_path / "take.xdf")
+    frame = MADE.coil_frame(1)
+
+    class Slow:
+        def __array__(self, dtype=None, copy=None) -> np.ndarray:
+            wait_until(lambda: recorder._closing, "the end")
+            return frame.positions
+
+    put = threading.Thread(
+        target=recorder.put,
+        args=(replace(frame, positions=Slow()), MADE.prepared_coils(1), MADE.tracked_pose(1)),
+    )
+    put.start()
+    wait_until(lambda: recorder._putting, "the frame")
+    assert (recorder.close().frames, recorder.not_recorded) == (1, 0)
+    put.join()
+    assert_holds(tmp_path / "take.xdf", 1)
+
+
 def test_a_recorder_that_was_never_opened_closes_without_a_file(tmp_path):
     recorder = TakeRecorder(MADE.take_info(), tmp_path / "take.xdf")
     MADE.put(recorder, 1)
@@ -411,7 +431,8 @@ def test_a_take_that_somebody_removes_while_it_is_recorded_is_told(tmp_path):
     (tmp_path / "take.xdf").unlink()
     put_all(recorder, 1, 10)
     wait_until(lambda: recorder.failure is not None, "the failure")
-    assert "removed" in recorder.failure
+    assert "has been removed" in recorder.failure
+    assert "readable" not in recorder.failure
     recorder.close()
 
 

@@ -6,6 +6,7 @@ import errno
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from ... import InputError
@@ -72,24 +73,26 @@ class AppendedFile:
         os.close(self._handle)
 
     def _cut(self) -> None:
-        try:
+        with suppress(OSError):  # readers stop at the last whole chunk by themselves
             os.ftruncate(self._handle, self.size)
             os.lseek(self._handle, self.size, os.SEEK_SET)
-        except OSError:
-            pass  # readers stop at the last whole chunk by themselves
 
 
 def flush_folder(folder: Path) -> None:
     """Makes the names of new files outlive a power cut, where the system has a way to."""
     if os.name == "nt":
         return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    except OSError:
-        pass  # some network file systems have no such thing
-    finally:
-        os.close(handle)
+    with suppress(OSError):  # a folder that may not be read, or a network file system without such a thing
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def is_gone(reason: OSError) -> bool:
+    """Whether nobody can find the file any more."""
+    return reason.errno in (errno.ENOENT, errno.ESTALE)
 
 
 def words_for(reason: OSError) -> str:
@@ -104,7 +107,7 @@ def words_for(reason: OSError) -> str:
         case errno.EIO:
             return "the disk reports an error (EIO)"
         case errno.ENOENT | errno.ESTALE:
-            return "the file or its folder was removed"
+            return "the file or its folder has been removed"
         case errno.EACCES | errno.EPERM | errno.EROFS:
             return "the folder cannot be written to"
         case errno.ENOTDIR:

@@ -29,7 +29,7 @@ from ... import InputError
 from ...drivers.frames import CoilFrame
 from ...drivers.xdf import boundary, file_header, samples, stream_footer, text_samples
 from ..pose import FloatArray, TrackedPose
-from .appending import AppendedFile, Sync, Write, flush_folder, flush_to_disk, words_for
+from .appending import AppendedFile, Sync, Write, flush_folder, flush_to_disk, is_gone, words_for
 from .headers import header_bytes
 from .journal import Journal, Rows, Words, journal_path, slot_dtype
 from .layout import MARKERS, POSE, PREPARED, RAW, STREAM_IDS, TakeInfo
@@ -48,6 +48,8 @@ JOURNAL_ROWS = 1024  # at least
 UNKNOWN_RATE_HZ = 1250.0
 CLOSE_PATIENCE_S = 30.0
 """How long `close` waits for a disk that takes nothing."""
+PUT_PATIENCE_S = 1.0
+"""How long the end of a take waits for a `put` that began before it."""
 _NS = 1e-9
 
 
@@ -97,6 +99,7 @@ class TakeRecorder:
         self._row = Row(info)
         self._accepting = False
         self._refused = 0
+        self._putting = False
         # Each of these has one thread that writes it: the loop's, the writer's, the flusher's.
         self._sequence = 0
         self._written, self._written_ns = 0, 0
@@ -162,7 +165,8 @@ class TakeRecorder:
             flush_folder(self.path.parent)
         except OSError as reason:
             self._file.close()
-            self.path.unlink(missing_ok=True)
+            with suppress(OSError):
+                self.path.unlink(missing_ok=True)
             if isinstance(reason, FileExistsError):
                 raise InputError(
                     f"{journal}: the journal of an earlier take of this name is still there; choose another "
@@ -180,17 +184,19 @@ class TakeRecorder:
 
         coils: (n, 3) the prepared coils, mm in the model frame, in the order of the roles.
         """
-        if not self._accepting:
-            self._refused += 1
-            return
-        sequence = self._sequence + 1
-        row = self._row
-        row.fill(sequence, frame, coils, pose)
-        if sequence - self._written > self._journal.capacity:
-            self._overflow.append(row.slot.copy())
+        self._putting = True
+        if self._accepting:
+            sequence = self._sequence + 1
+            row = self._row
+            row.fill(sequence, frame, coils, pose)
+            if sequence - self._written > self._journal.capacity:
+                self._overflow.append(row.slot.copy())
+            else:
+                self._journal.store(sequence, row.slot)
+            self._sequence = sequence
         else:
-            self._journal.store(sequence, row.slot)
-        self._sequence = sequence
+            self._refused += 1
+        self._putting = False
 
     def mark(self, text: str, time_ns: int) -> None:
         """Puts a text into the take. time_ns: `time.perf_counter_ns()`. From any thread."""
@@ -208,7 +214,8 @@ class TakeRecorder:
 
         The journal is removed once the take needs it no more.
         """
-        self._accepting = False
+        with self._marking:
+            self._accepting = False
         self._closing = True
         self._wake.set()
         if self._writer.ident is not None:
@@ -234,13 +241,19 @@ class TakeRecorder:
                 return
             self._writer.join(0.1)
 
-    def _fail(self, why: str) -> None:
+    def _fail_for(self, reason: OSError) -> None:
+        self._fail(words_for(reason), lost=is_gone(reason))
+
+    def _fail(self, why: str, lost: bool = False) -> None:
+        """lost: nothing is left that could be recovered."""
         self._accepting = False
+        kept = (
+            ""
+            if lost
+            else "what was written stays readable, `tonguetrack take recover` adds the last frames, and "
+        )
         if self.failure is None:
-            self.failure = (
-                f"{self.path}: {why}, so recording ended after {self._sequence} frames; what was written stays "
-                f"readable, `tonguetrack take recover` adds the last frames from the journal, and tracking goes on."
-            )
+            self.failure = f"{self.path}: {why}, so recording ended after {self._sequence} frames; {kept}tracking goes on."
 
     # The writer's thread ----------------------------------------------------------------------------
 
@@ -255,7 +268,7 @@ class TakeRecorder:
                 self._finish()
             whole = True
         except OSError as reason:
-            self._fail(words_for(reason))
+            self._fail_for(reason)
         finally:
             if not whole:  # tracking goes on whatever it was, and the user hears of it
                 self._fail("the writer met an error of its own")
@@ -319,6 +332,9 @@ class TakeRecorder:
         self.bytes_written = self._file.size
 
     def _finish(self) -> None:
+        end_s = time.monotonic() + PUT_PATIENCE_S
+        while self._putting and time.monotonic() < end_s:
+            time.sleep(0.001)
         self._drain()
         if self.failure is not None:
             return
@@ -344,7 +360,7 @@ class TakeRecorder:
             try:
                 self._file.flush()
             except OSError as reason:
-                self._fail(words_for(reason))
+                self._fail_for(reason)
                 return
             flushed = reached
             self._flushed = reached[0]

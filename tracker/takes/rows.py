@@ -25,7 +25,7 @@ class Row:
     def __init__(self, info: TakeInfo) -> None:
         dtype = slot_dtype(info.row_dtype())
         self.slot = np.zeros(dtype.itemsize // 8, np.int64)
-        self._memory = memoryview(self.slot).cast("B")
+        self._memory = self.slot.data.cast("B")
         self._content = self.slot[:-1]
         self._check = self.slot[-1:].reshape(())
         numbers = self.slot.view(np.float64)
