@@ -352,14 +352,14 @@ def test_a_damaged_frame_is_left_out_and_counted():
 
 
 def test_parameters_that_are_stated_are_told_and_give_the_rate():
-    xml = text(rtc3d.parameters_xml(400.0, ["jaw", "tip"]), rtc3d.XML)
+    xml = text(rtc3d.parameters_xml(400.0, ["jaw", "", "tip"]), rtc3d.XML)
 
     def script(command):
         return [text("OK"), xml] if command.startswith("SendP") else polite([frame(1)])(command)
 
     with ScriptedServer(script) as server, open_device(parse_source(server.uri)) as source:
         assert source.rate_hz == 400.0
-        assert "jaw, tip" in items_of(source, 1)[0].text
+        assert "jaw, (nothing), tip" in items_of(source, 1)[0].text
 
 
 def test_nothing_is_read_while_whole_packets_are_waiting_and_frames_are_decoded_when_asked_for():
@@ -388,6 +388,17 @@ def test_nothing_is_read_while_whole_packets_are_waiting_and_frames_are_decoded_
             conversation.receive(1.0)
         assert CountingLink.reads - reads <= 2
         conversation.goodbye()
+
+
+def test_parameters_without_names_are_not_told():
+    xml = text(rtc3d.parameters_xml(100.0, ["", ""]), rtc3d.XML)
+
+    def script(command):
+        return [text("OK"), xml] if command.startswith("SendP") else polite([frame(1)])(command)
+
+    with ScriptedServer(script) as server, open_device(parse_source(server.uri)) as source:
+        assert len(items_of(source, 1)) == 1
+        assert source.rate_hz == 100.0
 
 
 # The simulator, spoken to by hand

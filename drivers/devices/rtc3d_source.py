@@ -124,8 +124,9 @@ class Rtc3dConversation:
         except rtc3d.Rtc3dError:
             return  # nobody needs them
         self.rate_hz = parameters.rate_hz
-        if parameters.names:
-            self._note(NoteKind.INFO, f"{self._link.address} calls its sensors {', '.join(parameters.names)}")
+        if any(parameters.names):
+            names = ", ".join(name or "(nothing)" for name in parameters.names)
+            self._note(NoteKind.INFO, f"{self._link.address} calls its sensors {names}")
 
     def _begin(self) -> int:
         """Has frames sent, and returns how many sensors the first one has."""
