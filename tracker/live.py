@@ -20,7 +20,7 @@ from .setup import Setup
 from .status import LiveStatus, Summary, summarise
 from .streams.osc import OscSink
 from .streams.sink import Sink, StreamInfo
-from .takes.layout import SESSION_MARK, SOURCE_MARK
+from .takes.layout import MARKER_WORDS, SESSION_MARK, SOURCE_MARK
 
 if TYPE_CHECKING:
     from .background import BackgroundSpeaker

@@ -47,7 +47,9 @@ def retrack(take: Take, model: TongueModel) -> Retracked:
             f"{take.path}: recorded with the model '{info.model_name}' [{info.model_fingerprint}], not with "
             f"'{model.name}' [{model.fingerprint}]; name that one with --model."
         )
-    changes = [(row, parse_session(text, f"{take.path}, session of row {row}")) for row, text in take.sessions]
+    changes = [
+        (row, parse_session(text, f"{take.path}, session of row {row}")) for row, text in take.sessions
+    ]
     setup = _setup(take, changes[0][1])
     # Points that a client of the authors' server sends have no coil map, and every one is believed.
     tracker = Tracker(model, setup, info.rate_hz, watchful=bool(changes[0][1].coils))
