@@ -3,6 +3,7 @@
 import json
 import math
 import socket
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -358,6 +359,23 @@ def test_no_frame_is_overwritten_however_slow_the_reader(served):
     found += [next_of(source) for _ in range(990)]
     assert [frame.device_time_s for frame in found] == list(range(1000))
     assert [frame.frame_number for frame in found] == list(range(1, 1001))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no other system counts them")
+def test_what_the_system_had_no_room_for_is_told(served):
+    source, client = served()
+    source._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    found = []
+    for _ in range(2):
+        for k in range(500):
+            client.fit(k, P, Q)
+        found += [next_of(source), next_of(source)]
+    client.fit(1e6, P, Q)  # the loss is told with what comes after it
+    while not (isinstance(found[-1], CoilFrame) and found[-1].device_time_s == 1e6):
+        found.append(next_of(source))
+    frames = [item for item in found if isinstance(item, CoilFrame)]
+    lost = [item.count for item in found if not isinstance(item, CoilFrame) and item.kind is NoteKind.GAP]
+    assert 0 < len(frames) < 1001 and len(frames) + sum(lost) == 1001
 
 
 def test_waiting_costs_no_processor_time(served):

@@ -26,6 +26,7 @@ import json
 import math
 import select
 import socket
+import sys
 import time
 from collections import deque
 from collections.abc import Callable
@@ -46,6 +47,8 @@ DEFAULT_REPLY = "127.0.0.1:1235"
 MOST_WAITING = 4096
 """So many datagrams are kept for a slow reader; what comes on top waits in the system's own buffer."""
 RECEIVE_BUFFER_BYTES = 1 << 22
+_COUNT_LOST = 40 if sys.platform == "linux" else None
+"""SO_RXQ_OVFL of <asm-generic/socket.h>: each datagram says how many the system had no room for before it."""
 MODEL_FRAME = FrameOfReference("left", "back", "up", "model")
 SETTINGS = ("speakerSmoothnessTerm", "phonemeSmoothnessTerm", "priorSize")
 
@@ -170,7 +173,8 @@ def _vertices(value: object) -> tuple[int, ...]:
 
 
 class AuthorsLive:
-    """Their clients as a source. Every FIT that arrives is delivered, in order; none is overwritten.
+    """Their clients as a source. Every FIT that arrives is delivered, in order; none is overwritten, and where
+    the system had no room for one, a GAP note says so (on Linux, which alone counts them).
 
         source = open_authors_live(address)
         if source.wait_until_ready(tick): ...   # then `coils` and `vertices` are known
@@ -192,7 +196,8 @@ class AuthorsLive:
         self._socket = bound
         self._vertices = vertices
         self._stopped = False
-        self._waiting: deque[tuple[bytes, int]] = deque()  # datagrams and their arrival
+        self._waiting: deque[tuple[bytes, int, int]] = deque()  # datagram, arrival, lost by the system so far
+        self._lost = 0
         self._said: deque[CoilFrame | SourceNote] = deque(maxlen=MOST_WAITING)  # comes before what waits
         self._fits = 0
         self._last_time_s = -math.inf
@@ -283,7 +288,12 @@ class AuthorsLive:
         self._drain()
         if not self._waiting:
             return None
-        datagram, arrival_ns = self._waiting.popleft()
+        datagram, arrival_ns, lost = self._waiting[0]
+        if lost > self._lost:
+            count, self._lost = lost - self._lost, lost
+            text = f"{count} requests were lost: they came faster than they were read"
+            return self._note(NoteKind.GAP, text, arrival_ns, count)
+        self._waiting.popleft()
         try:
             return self._obeyed(parse_request(datagram), arrival_ns)
         except BadRequest as reason:
@@ -291,10 +301,15 @@ class AuthorsLive:
 
     def _drain(self) -> None:
         """Takes what has arrived out of the system's buffer, whose size nobody can rely on."""
+        lost = self._lost
         try:
             while len(self._waiting) < MOST_WAITING:
-                datagram = self._socket.recv(LARGEST_DATAGRAM + 1)
-                self._waiting.append((datagram, time.perf_counter_ns()))
+                if _COUNT_LOST is None:
+                    datagram = self._socket.recv(LARGEST_DATAGRAM + 1)
+                else:
+                    datagram, extra, _, _ = self._socket.recvmsg(LARGEST_DATAGRAM + 1, socket.CMSG_SPACE(4))
+                    lost = next((int.from_bytes(data, sys.byteorder) for _, kind, data in extra), lost)
+                self._waiting.append((datagram, time.perf_counter_ns(), lost))
         except OSError:  # nothing more; or an earlier answer was refused, which is not our business here
             pass
 
@@ -361,6 +376,8 @@ def open_authors_live(address: SourceAddress) -> AuthorsLive:
         raise InputError(f"'{address.text}': '{host}' is not a host that is known here.") from reason
     try:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        if _COUNT_LOST is not None:
+            bound.setsockopt(socket.SOL_SOCKET, _COUNT_LOST, 1)
         bound.bind((host, address.port))
     except OSError as reason:
         bound.close()
