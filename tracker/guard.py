@@ -91,7 +91,9 @@ class CoilGuard:
 
 
 @njit(**OPTIONS)
-def _step_is_possible(coils, i, memory, first, then_s, time_s):
+def _step_is_possible(
+    coils: FloatArray, i: int, memory: FloatArray, first: int, then_s: float, time_s: float
+) -> bool:
     """Whether coil i can have come from the position in memory rows first.. within the time since then."""
     if np.isnan(memory[first, i]):
         return True
@@ -100,11 +102,13 @@ def _step_is_possible(coils, i, memory, first, then_s, time_s):
         way = coils[i, axis] - memory[first + axis, i]
         squared += way * way
     room = SLACK_MM + FASTEST_MM_S * min(max(time_s - then_s, 0.0), LONGEST_STEP_S)
-    return squared <= room * room
+    return bool(squared <= room * room)
 
 
 @njit(**OPTIONS)
-def _admit(coils, time_s, memory, states, used):
+def _admit(
+    coils: FloatArray, time_s: float, memory: FloatArray, states: NDArray[np.int64], used: FloatArray
+) -> None:
     n = coils.shape[0]
     for i in range(n):
         if np.isnan(coils[i, 0]):
@@ -159,7 +163,9 @@ def _admit(coils, time_s, memory, states, used):
 
 
 @njit(**OPTIONS)
-def _learn(residuals, time_s, step_s, memory, states):
+def _learn(
+    residuals: FloatArray, time_s: float, step_s: float, memory: FloatArray, states: NDArray[np.int64]
+) -> None:
     n = residuals.shape[0]
     trusted = 0
     worst = -1

@@ -120,7 +120,7 @@ class LiveRun:
         changes = tracker.changes
         end = _End(self.seconds, self.source)
         for item in self.source:
-            if type(item) is not CoilFrame:
+            if not isinstance(item, CoilFrame):
                 if not self._note(item, recorder):
                     break
             else:

@@ -34,7 +34,7 @@ class FrameClock:
 
     def __init__(self) -> None:
         self.missing = 0
-        self._number_steps: deque[int] = deque(maxlen=LEARN_FROM)
+        self._number_steps: deque[float] = deque(maxlen=LEARN_FROM)
         self._time_steps: deque[float] = deque(maxlen=LEARN_FROM)
         self._step = 0
         self._period_s = 0.0
@@ -82,21 +82,21 @@ class FrameClock:
             frames = round(by / self._step) if self._step else 1
             if by_s > 0 and self._period_s and frames * self._period_s - by_s > RESET_APART_S:
                 return Verdict.RESET
-            self._step = _learned(self._number_steps, by, self._step)
+            self._step = int(_learned(self._number_steps, by, self._step))
         elif by_s > 0:
             frames = round(by_s / self._period_s) if self._period_s else 1
         else:
             frames = 1
         if by_s > 0:
-            self._period_s = float(_learned(self._time_steps, round(by_s, 6), self._period_s))
+            self._period_s = _learned(self._time_steps, round(by_s, 6), self._period_s)
         self.missing = max(0, frames - 1)
         return Verdict.GAP if self.missing else Verdict.NEXT
 
 
-def _learned(steps: deque, step: float, before: float) -> float:
+def _learned(steps: deque[float], step: float, before: float) -> float:
     """The commonest of the latest steps, the smaller one where two are equally common."""
     steps.append(step)
-    if len(steps) < SURE_AFTER:
+    if len(steps) < SURE_AFTER or step == before:  # one more of the commonest changes nothing
         return before
     counts = Counter(steps)
     most = max(counts.values())

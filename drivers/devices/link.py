@@ -138,7 +138,7 @@ def open_serial(path: str, baud: int = 9600) -> SerialLink:
 
     try:
         # Only ports of this host can be locked, or give up writing: a network's own end does that elsewhere.
-        options = {} if "://" in path else {"exclusive": True, "write_timeout": SEND_TIMEOUT_S}
+        options: dict[str, Any] = {} if "://" in path else {"exclusive": True, "write_timeout": SEND_TIMEOUT_S}
         port = serial.serial_for_url(path, baudrate=baud, timeout=SERIAL_WAIT_S, **options)
     except (OSError, ValueError) as reason:
         raise LinkLost(f"{path}: {_words(reason)}") from reason
