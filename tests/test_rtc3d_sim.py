@@ -25,7 +25,7 @@ from tonguetrack.drivers.simulators.motion import SimulatedMotion
 from tonguetrack.drivers.sources import open_device, parse_source
 
 COILS = ("tip", "mid", "back")
-RATE_HZ = 200.0
+RATE_HZ = 400.0
 
 
 # Servers that are told what to answer
@@ -536,13 +536,13 @@ def test_one_frame_comes_when_asked_for_in_the_byte_order_agreed_on(quiet_device
             assert hand.ask("SendCurrentFrame 3D 6D").kind == rtc3d.COMMAND
             components = rtc3d.decode_frame(hand.hear().body, order)
             assert [c.kind for c in components] == [rtc3d.THREE_D, rtc3d.SIX_D]
-            assert components[0].time_us == components[0].number * 5000
+            assert components[0].time_us == components[0].number * 2500
         hand.ask("SendCurrentFrame Analog")
         assert hand.hear().kind == rtc3d.NO_DATA
 
 
 @pytest.mark.parametrize(
-    ("pace", "step"), [("AllFrames", 1), ("Frequency:50", 4), ("Frequency:1000", 1), ("FrequencyDivisor:3", 3)]
+    ("pace", "step"), [("AllFrames", 1), ("Frequency:50", 8), ("Frequency:1000", 1), ("FrequencyDivisor:3", 3)]
 )  # fmt: skip
 def test_frames_come_as_often_as_asked_for_until_stopped(quiet_device, pace, step):
     with Hand(quiet_device) as hand:
@@ -699,22 +699,22 @@ def test_a_cut_connection_is_told_and_made_again(played):
 @pytest.mark.parametrize("seconds", [-100, 100])
 def test_a_jump_in_time_is_told_and_no_frame_is_lost(played, seconds):
     with (
-        simulator(played, "--faults", f"jump={seconds}@0.3") as uri,
+        simulator(played, "--faults", f"jump={seconds}@0.25") as uri,
         open_device(parse_source(uri)) as source,
     ):
-        items = items_of(source, 100)
+        items = items_of(source, 150)
     numbers, missing = numbers_and_gaps(items)
-    assert notes_of(items, NoteKind.CLOCK_RESET) or seconds < 0
-    assert numbers == list(range(numbers[0], numbers[0] + 100))
+    assert notes_of(items, NoteKind.CLOCK_RESET)
+    assert numbers == list(range(numbers[0], numbers[0] + 150))
     assert missing == 0
 
 
 def test_a_coil_dies_and_comes_back(played):
     with simulator(played, "--faults", "dead=mid@0.1-0.3") as uri, open_device(parse_source(uri)) as source:
-        got = frames_of(items_of(source, 100))
+        got = frames_of(items_of(source, 150))
     dead = np.array([np.isnan(item.positions).all(axis=1) for item in got])
     assert not dead[:, [0, 2]].any()
-    np.testing.assert_array_equal(np.flatnonzero(dead[:, 1]), np.arange(20, 60))
+    np.testing.assert_array_equal(np.flatnonzero(dead[:, 1]), np.arange(40, 120))
 
 
 def test_a_coil_goes_wild(played):
