@@ -1,5 +1,5 @@
 """The simulated NDI device as a process, driven by software that nobody here wrote: `ndicapi` (the C client of
-the Plus toolkit, imported as `ndicapy`), scikit-surgerynditracker, and plain pyserial; and by our own driver."""
+the Plus toolkit, imported as `ndicapy`), scikit-surgerynditracker, and plain pyserial."""
 
 from __future__ import annotations
 
@@ -12,11 +12,8 @@ import socket
 import struct
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +22,10 @@ import pytest
 
 from tonguetrack import InputError
 from tonguetrack.drivers.devices.ndi import command, parse_bx, parse_reply
-from tonguetrack.drivers.devices.ndi_source import open_ndi
-from tonguetrack.drivers.frames import CoilFrame, NoteKind, Recording, SourceNote
+from tonguetrack.drivers.frames import Recording
 from tonguetrack.drivers.simulators.faults import FaultPlan
 from tonguetrack.drivers.simulators.motion import SimulatedMotion
 from tonguetrack.drivers.simulators.ndi_sim import run_ndi
-from tonguetrack.drivers.sources import parse_source
 
 RECORDING = str(Path(__file__).resolve().parents[1] / "recordings" / "demo.csv")
 FRAMES = 400
@@ -48,8 +43,7 @@ def position(frame: int, coil: int) -> list[float]:
 DEVICE = """
 import json, sys
 import numpy as np
-from tonguetrack.drivers.devices.ndi_source import open_ndi
-from tonguetrack.drivers.frames import CoilFrame, NoteKind, Recording, SourceNote
+from tonguetrack.drivers.frames import Recording
 from tonguetrack.drivers.simulators.faults import parse_faults
 from tonguetrack.drivers.simulators.motion import SimulatedMotion
 from tonguetrack.drivers.simulators.ndi_sim import run_ndi
@@ -447,91 +441,3 @@ def test_a_signal_ends_the_simulator_cleanly(transport: str, number: int) -> Non
     assert (code, said) == (0, "")
     if transport == "pty":
         assert not os.path.exists(device.place)
-
-
-# --- our own driver -------------------------------------------------------------------------------------------
-
-
-def collect(uri: str, frames: int, until: NoteKind | None = None) -> tuple[list[CoilFrame], list[SourceNote]]:
-    """The first so many frames from the driver (with their own arrays), after the note `until`, and all notes."""
-    found: list[CoilFrame] = []
-    notes: list[SourceNote] = []
-    deadline = time.monotonic() + WAIT_S
-    with open_ndi(parse_source(uri)) as source:
-        for item in source:
-            assert time.monotonic() < deadline, f"{len(found)} frames and {notes}"
-            if isinstance(item, SourceNote):
-                notes.append(item)
-                continue
-            if until is None or until in [note.kind for note in notes]:
-                found.append(replace(item, positions=item.positions.copy(), status=np.array(item.status)))
-            if len(found) == frames:
-                break
-    return found, notes
-
-
-def check_frame(frame: CoilFrame) -> None:
-    expected = [position(frame.frame_number // 8, coil) for coil in range(4)]
-    np.testing.assert_allclose(frame.positions, expected, atol=1e-4)
-    assert frame.status is not None
-    assert frame.status.tolist() == [0x3F, 0x3F, 0x7F, 0x3F]
-
-
-@pytest.mark.parametrize("transport", ["tcp", "pty", "rfc2217"])
-def test_our_driver_goes_through_the_whole_handshake_and_says_goodbye(transport: str) -> None:
-    if transport != "tcp":
-        pytest.importorskip("serial")
-    with simulator(transport, reset_s=0.3) as device:
-        frames, _ = collect(device.uri, 20)
-        commands = device.commands()
-        text = device.stop()[1]
-    for frame in frames:
-        check_frame(frame)
-    assert all(later.frame_number > earlier.frame_number for earlier, later in pairwise(frames))
-    assert commands[0] == "INIT"
-    assert commands.count("PINIT") == 2
-    assert commands.count("PENA") == 4
-    if transport == "tcp":
-        assert commands[-1] == "TSTOP"
-    else:
-        assert "COMM:60000" in text
-        assert commands[-2:] == ["TSTOP", "COMM"]
-        assert "COMM:00000" in text
-
-
-@pytest.mark.parametrize("transport", ["pty", "rfc2217"])
-def test_our_driver_finds_a_device_that_another_client_left_at_another_speed(transport: str) -> None:
-    with simulator(transport, reset_s=0.3) as device:
-        with open_port(device) as port:
-            exchange(port, command("INIT"))
-            assert exchange(port, command("COMM", "50000")) == b"OKAYA896\r"
-        frames, notes = collect(device.uri + "?baud=230400&reply=tx", 3)
-        text = device.stop()[1]
-    for frame in frames:
-        assert np.isfinite(frame.positions[[0, 1, 3]]).all()
-    assert "COMM:A0000" in text
-    assert "BX" not in text
-    assert not [note for note in notes if "did not answer a break" in note.text]
-
-
-@pytest.mark.parametrize(
-    ("faults", "kind"),
-    [
-        ("drop=0.2", NoteKind.GAP),
-        ("corrupt=0.2@0.2-1", NoteKind.BAD_DATA),
-        ("stall=0.5@0.3", NoteKind.SILENT),
-        ("jump=20@0.3", NoteKind.CLOCK_RESET),
-        ("disconnect@0.3", NoteKind.CONNECTED),
-    ],
-)
-def test_our_driver_tells_each_fault_and_delivers_what_was_measured_all_the_same(
-    faults: str, kind: NoteKind
-) -> None:
-    with simulator("tcp", faults=faults) as device:
-        frames, notes = collect(device.uri, 5, until=kind)
-    assert kind in [note.kind for note in notes]
-    for frame in frames:
-        if "jump" in faults:
-            assert frame.frame_number > 8 * 20 * 40
-        else:
-            check_frame(frame)
