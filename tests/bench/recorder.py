@@ -4,7 +4,8 @@
 
 The obvious way (`bytes + queue`) makes one bytes object of the frame and appends it to a queue; it loses what a
 killed process had in there. Both are timed in turns, in the same run, with the recorder's threads at work.
-Then frames come at 1250 Hz while the disk is slow on purpose: flushes of 2 s, writes of 1 s.
+Then frames come at 1250 Hz, by which time a sleeping loop has lost its caches: again both ways, and with a disk
+that is slow on purpose, flushes of 2 s, writes of 1 s.
 """
 
 import argparse
@@ -52,13 +53,10 @@ def some_pose() -> TrackedPose:
     )
 
 
-def cost_of_put(sensors: int, folder: Path) -> str:
-    frames, coils, pose = some_frames(sensors), np.zeros((3, 3)), some_pose()
-    recorder = TakeRecorder(take_info(sensors, 1250.0), folder / f"{sensors}.xdf")
-    recorder.open()
+def obvious_way(coils: np.ndarray, pose: TrackedPose) -> Callable[[CoilFrame], None]:
     queue: deque[bytes] = deque(maxlen=1000)
 
-    def obvious(frame: CoilFrame) -> None:
+    def append(frame: CoilFrame) -> None:
         head = np.array([frame.device_time_s, frame.frame_number, pose.status, pose.energy, pose.residual_mm])
         assert frame.quaternions is not None and frame.rms is not None and frame.status is not None
         queue.append(
@@ -67,6 +65,14 @@ def cost_of_put(sensors: int, folder: Path) -> str:
             + pose.residuals_mm.tobytes() + pose.coil_states.tobytes()
         )  # fmt: skip
 
+    return append
+
+
+def cost_of_put(sensors: int, folder: Path) -> str:
+    frames, coils, pose = some_frames(sensors), np.zeros((3, 3)), some_pose()
+    recorder = TakeRecorder(take_info(sensors, 1250.0), folder / f"{sensors}.xdf")
+    recorder.open()
+    obvious = obvious_way(coils, pose)
     times: dict[str, list[int]] = {"put": [], "bytes + queue": []}
     for _ in range(TURNS):
         for name, ways in (
@@ -137,6 +143,8 @@ def main() -> None:
         folder = Path(name)
         for sensors in (16, 24):
             print(cost_of_put(sensors, folder))
+        paced = timed(obvious_way(np.zeros((3, 3)), some_pose()), some_frames(24), 3000, 1 / 1250)
+        print(f"bytes + queue, 24 sensors, 1250 Hz: {percentiles(paced)}")
         print(on_a_slow_disk("a good disk", os.write, flush_to_disk, folder, arguments.seconds))
         print(on_a_slow_disk("flushes of 2 s", os.write, slow_sync, folder, arguments.seconds))
         print(on_a_slow_disk("writes of 1 s", slow_write, flush_to_disk, folder, arguments.seconds))
