@@ -11,11 +11,13 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tonguetrack import InputError
 from tonguetrack.drivers import Recording, write_recording
 from tonguetrack.drivers.devices import rtc3d, rtc3d_source
-from tonguetrack.drivers.devices.link import TcpLink, connect_tcp
+from tonguetrack.drivers.devices.link import LinkLost, TcpLink, connect_tcp
 from tonguetrack.drivers.devices.rtc3d import BIG, LITTLE, Component
 from tonguetrack.drivers.devices.source import DeviceSource
 from tonguetrack.drivers.frames import CoilFrame, NoteKind, SourceNote
@@ -399,6 +401,61 @@ def test_parameters_without_names_are_not_told():
     with ScriptedServer(script) as server, open_device(parse_source(server.uri)) as source:
         assert len(items_of(source, 1)) == 1
         assert source.rate_hz == 100.0
+
+
+class Bytes:
+    """A link on which these pieces arrive, and then nothing for ever: it is lost."""
+
+    address = "test"
+
+    def __init__(self, pieces):
+        self.pieces = iter(pieces)
+
+    def send(self, data):
+        pass
+
+    def receive(self, timeout_s):
+        try:
+            return next(self.pieces)
+        except StopIteration:
+            raise LinkLost("the end") from None
+
+    def close(self):
+        pass
+
+
+CONVERSED = text("OK") * 2 + text(rtc3d.parameters_xml(400.0, ["a"]), rtc3d.XML) + text("OK")
+CONVERSED += b"".join(frame(k, missing=[1]) for k in range(1, 8)) + text("nothing", rtc3d.NO_DATA)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, len(CONVERSED) - 1), st.integers(1, 255)), max_size=4),
+    st.integers(1, 400),
+    st.integers(0, len(CONVERSED)),
+)
+def test_whatever_a_server_sends_is_frames_notes_or_a_lost_link(damages, step, end):
+    stream = bytearray(CONVERSED)
+    for place, damage in damages:
+        stream[place] ^= damage
+    stream = bytes(stream[:end])
+    pieces = [stream[start : start + step] for start in range(0, len(stream), step)]
+    with pytest.raises(LinkLost):
+        conversation = rtc3d_source.Rtc3dConversation(Bytes(pieces))
+        for _ in range(1000):
+            item = conversation.receive(1.0)
+            assert isinstance(item, CoilFrame | SourceNote)
+            assert not isinstance(item, CoilFrame) or len(item.positions) == len(conversation.coils)
+
+
+@pytest.mark.parametrize("flood", [text("OK"), text("Error-x", rtc3d.ERROR), rtc3d.encode_packet(rtc3d.DATA, bytes(4))])  # fmt: skip
+def test_a_flood_of_what_is_no_frame_ends_the_handshake_and_every_wait(hurried, flood):
+    with pytest.raises(LinkLost, match="no frame with sensors"):
+        rtc3d_source.Rtc3dConversation(Bytes(itertools.repeat(flood * 10)))
+    answers = itertools.chain([CONVERSED], itertools.repeat(flood * 10))
+    conversation = rtc3d_source.Rtc3dConversation(Bytes(answers))
+    items = [conversation.receive(0.01) for _ in range(15)]
+    assert items[-1] is None and len(conversation._notes) <= 1
 
 
 # The simulator, spoken to by hand

@@ -162,7 +162,7 @@ def run_device(args: argparse.Namespace) -> int:
             flush=True,
         )
 
-    signal.signal(signal.SIGTERM, _interrupt)
+    before = signal.signal(signal.SIGTERM, _interrupt)
     try:
         if args.device == "rtc3d":
             from ...drivers.simulators.rtc3d_sim import run_rtc3d
@@ -188,6 +188,8 @@ def run_device(args: argparse.Namespace) -> int:
             )  # fmt: skip
     except KeyboardInterrupt:
         pass
+    finally:
+        signal.signal(signal.SIGTERM, before)
     return 0
 
 
