@@ -629,3 +629,35 @@ def test_a_line_that_cannot_change_its_speed_is_a_lost_link():
     port.__class__ = Stubborn
     with pytest.raises(LinkLost, match="scripted: not this speed"):
         line.set_baud(115200)
+
+
+def test_whatever_comes_in_the_place_of_replies_no_wrong_frame_comes_out(serial, monkeypatch):
+    for name, seconds in (("QUIET_S", 0.004), ("DAMAGED_QUIET_S", 0.002), ("POLL_TIMEOUT_S", 0.01)):
+        monkeypatch.setattr(ndi_source, name, seconds)
+    random = np.random.default_rng(3)
+    measurements = []
+    for number in range(8, 8 * 151, 8):
+        good = ndi.encode_bx(TrackingReply(moving(number)[0]), 0x0801)
+        kind = random.integers(6)
+        if kind == 0:
+            good = random.bytes(int(random.integers(200)))
+        elif kind == 1:
+            good = good[: random.integers(len(good))]
+        elif kind == 2:
+            place = int(random.integers(len(good)))
+            good = good[:place] + random.bytes(int(random.integers(1, 9))) + good[place + 1 :]
+        measurements.append(good)
+    device = Device(measurements=[*measurements, *moving(8 * 151, 8 * 152)])
+    with serial(device, "?baud=9600") as source:
+        source._idle_s = 20.0
+        monkeypatch.setattr(source, "_pause_s", 0.0)
+        frames, ends_s = [], time.perf_counter() + 20
+        for item in source:
+            if isinstance(item, CoilFrame):
+                frames.append(item.frame_number)
+                assert item.frame_number % 8 == 0
+                assert item.positions.tolist() == [[1.0, 2.0, 3.0]] * 2
+                if item.frame_number == 8 * 152:
+                    break
+            assert time.perf_counter() < ends_s
+    assert len(frames) > 60

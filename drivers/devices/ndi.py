@@ -127,7 +127,7 @@ def _crc_table() -> tuple[int, ...]:
 _CRC_TABLE = _crc_table()
 
 
-def crc16(data: bytes | memoryview, crc: int = 0) -> int:
+def crc16(data: bytes | bytearray, crc: int = 0) -> int:
     """CRC-16/ARC (polynomial 0x8005 reflected, start 0), as commands and replies have it."""
     table = _CRC_TABLE
     for byte in data:
@@ -535,7 +535,7 @@ def _bx_length(data: bytes | bytearray) -> int | None:
     """The length that a binary reply's header says; None where it is no header or its CRC is wrong."""
     if len(data) < _BX_HEADER or data[:2] != BX_START:
         return None
-    if int.from_bytes(data[4:6], "little") != crc16(bytes(data[:4])):
+    if int.from_bytes(data[4:6], "little") != crc16(data[:4]):
         return None
     return int.from_bytes(data[2:4], "little")
 

@@ -162,15 +162,25 @@ class Device:
                     pass
         raise LinkLost(f"{self.link.address}: what comes back for {name} is damaged, {TRIES} times")
 
+    def next_text(self, timeout_s: float) -> str | None:
+        """The next ASCII reply, of a refusal its words; None when none came in time."""
+        deadline = time.perf_counter() + timeout_s
+        while (left_s := deadline - time.perf_counter()) > 0:
+            item = self._wait(left_s)
+            if isinstance(item, ndi.Reply) and not item.binary:
+                try:
+                    return ndi.parse_reply(item.data)
+                except ndi.NdiError as refusal:
+                    return str(refusal)
+        return None
+
     def wait_for(self, text: str, timeout_s: float) -> bool:
         """Whether that reply came in time; others before it do not matter."""
         deadline = time.perf_counter() + timeout_s
-        while (left_s := deadline - time.perf_counter()) > 0:
-            reply = self._wait(left_s)
-            with suppress(ndi.NdiError, ndi.NdiDamaged):
-                if isinstance(reply, ndi.Reply) and ndi.parse_reply(reply.data) == text:
-                    return True
-        return False
+        heard: str | None = ""
+        while heard is not None and heard != text:
+            heard = self.next_text(deadline - time.perf_counter())
+        return heard == text
 
     def start(self) -> None:
         """INIT, where the speed is not in question; a device that is still tracking is stopped first."""
@@ -188,7 +198,7 @@ class Device:
         self._introduce()
 
     def enable_tools(self) -> tuple[Coil, ...]:
-        """Handles that are left over are freed; all tools are initialised and enabled. Raises LinkLost without any."""
+        """Frees handles that are left over, initialises and enables all tools. Raises LinkLost without any."""
         for port in self._ports(FREE_PORTS):
             self._try("PHF", f"{port.handle:02X}", f"handle {port.handle:02X} could not be freed")
         refused: set[int] = set()
@@ -245,7 +255,7 @@ class Device:
             self.ask("INIT", timeout_s=SLOW_TIMEOUT_S)
 
     def _change_speed(self, line: SerialLine, baud: int) -> bool:
-        """Whether the device and the line understand each other at the new speed; if not, it was refused or reset."""
+        """Whether both understand each other at the new speed; if not, the device refused it or was reset."""
         try:
             self.ask("COMM", ndi.comm_arguments(baud))
             time.sleep(SPEED_PAUSE_S)
@@ -394,13 +404,16 @@ class NdiConversation:
 
     def goodbye(self) -> None:
         """See `source.Conversation`."""
-        with suppress(LinkLost, ndi.NdiDamaged):
-            self._link.send(ndi.command("TSTOP"))
-            self._device.wait_for(ndi.OKAY, GOODBYE_TIMEOUT_S)
-            if self._line is not None and self._line.baud != FIRST_BAUD:
-                self._link.send(ndi.command("COMM", ndi.comm_arguments(FIRST_BAUD)))
-                self._device.wait_for(ndi.OKAY, GOODBYE_TIMEOUT_S)
+        with suppress(LinkLost):
+            answers = self._tell("TSTOP")
+            if answers and self._line is not None and self._line.baud != FIRST_BAUD:
+                self._tell("COMM", ndi.comm_arguments(FIRST_BAUD))
         self._link.close()
+
+    def _tell(self, name: str, arguments: str = "") -> bool:
+        """Sends a last command; whether any answer came."""
+        self._link.send(ndi.command(name, arguments))
+        return self._device.next_text(GOODBYE_TIMEOUT_S) is not None
 
     def _poll(self, deadline: float) -> bool:
         """Asks for the newest measurement, unless an answer to an older question is on its way already."""
