@@ -36,8 +36,8 @@ SHORTEST_STEP = 1e-9
 EXACT, GAUSS_NEWTON, POSES_HELD = 0, 1, 2
 
 REWEIGHTINGS = 3
-# The distance at which a sample's weight is 1/2, in medians of all samples' distances. On speakers whom the model had
-# never seen, 5 costs clean speech nothing measurable, and samples 50 mm astray no longer tell; 3 costs a little.
+# The distance at which a sample's weight is 1/2, in medians of all samples' distances. On real speakers left out of
+# the model, 5 costs clean speech nothing measurable, and samples 50 mm astray hardly tell; 3 costs a little.
 OUTLIER_MEDIANS = 5.0
 
 # With a smaller share of the coordinates left over, the poses follow the coils wherever they are.
@@ -111,8 +111,8 @@ class State(NamedTuple):
 class Work(NamedTuple):
     """Work space, made once. directions (k, 3n) and gram (n, k, k) belong to the current speaker; of one frame:
     residual (3n,), slopes (m, 3n) d v / d s, cross (m, k), pose_hessian (k, k), pose_linear (k,), eliminated
-    (k, m + k); of the reduced system: gradient, linear, target, before (m,), hessian (m, m); ends (2, m): the start and
-    the best end; distances (T, n) mm.
+    (k, m + k); of the reduced system: gradient, linear, target, before (m,), hessian (m, m); ends (2, m): the
+    start and the best end; distances (T, n) mm.
     """
 
     directions: FloatArray
@@ -135,8 +135,9 @@ class Work(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """energy: F at the end; residual_mm: mean distance over all samples; frames: those with a coil; variance: of
-    one coordinate's residual, in units of F, infinite where there are no more coordinates than weights; steps; at_rest: whether the last descent ended at a minimum."""
+    """energy: F at the end; residual_mm: mean distance over all samples; frames: those with a coil; variance: of one
+    coordinate's residual, in units of F, infinite where there are no more coordinates than weights; steps: of
+    Newton, in all; at_rest: whether the last descent ended at a minimum."""
 
     energy: float
     residual_mm: float
@@ -353,7 +354,7 @@ def _eliminate_pose(problem: Problem, state: State, work: Work, frame: int) -> f
 @njit(**OPTIONS)
 def _set_target(problem: Problem, state: State, work: Work) -> float:
     """Sets work.target to the minimiser of the quadratic model of f in the box; returns the decrease it promises,
-    negative where the Hessian is not positive definite."""
+    below 0 where the Hessian is not positive definite."""
     speakers = state.speaker.shape[0]
     for a in range(speakers):
         total = -work.gradient[a]
@@ -366,7 +367,7 @@ def _set_target(problem: Problem, state: State, work: Work) -> float:
         work.speaker_quadratic,
     )  # fmt: skip
     if outcome == INDEFINITE:
-        return -1.0
+        return -np.inf
     promised = 0.0
     for a in range(speakers):
         step = work.target[a] - state.speaker[a]
@@ -390,7 +391,7 @@ def _descend(problem: Problem, state: State, work: Work) -> tuple[float, int, bo
             reduce_to_speaker(problem, state, work, GAUSS_NEWTON)
             promised = _set_target(problem, state, work)
         if not promised > RELATIVE_DECREASE * energy:
-            return energy, step, np.isfinite(energy)
+            return energy, step, promised > -np.inf  # nor is it so where the energy is not a number
         slope = 0.0
         for l in range(speakers):
             work.before[l] = state.speaker[l]
@@ -406,14 +407,14 @@ def _descend(problem: Problem, state: State, work: Work) -> tuple[float, int, bo
         if not reached < energy:  # nothing is lower by more than rounding
             for l in range(speakers):
                 state.speaker[l] = work.before[l]
-            return solve_poses(problem, state, work), step, np.isfinite(energy)
+            return solve_poses(problem, state, work), step, True
         energy = reached
     return energy, MAX_STEPS, False
 
 
 @njit(**OPTIONS)
 def _median(values: FloatArray) -> float:
-    """The median of those of values (T, n) >= 0 that are numbers, to a millionth of the largest: by halving."""
+    """The median of those of values (T, n) >= 0 that are numbers, to 1e-12 of the largest: by halving."""
     count = 0
     high = 0.0
     for row in range(values.shape[0]):
@@ -548,7 +549,7 @@ class SpeakerEstimator:
         self._model = model
         self._base = np.array(model.origin)
         self._core = np.array(model.core)
-        self._boxes = tuple(
+        self._speaker_box, self._pose_box = (
             np.stack([mode.mean, mode.mean - energy.box * mode.sigma, mode.mean + energy.box * mode.sigma])
             for mode in (model.speaker, model.pose)
         )
@@ -595,7 +596,7 @@ class SpeakerEstimator:
         )
         terms = np.array([self._energy.alpha, bias_pose, bias_frames(tracked) * bias_speaker])
         self.outcome = estimate(
-            Problem(coils, self._base, self._core, *self._boxes, terms, self._flips),
+            Problem(coils, self._base, self._core, self._speaker_box, self._pose_box, terms, self._flips),
             State(self._speaker, self.poses[:frames], self.trust[:frames]),
             self._work._replace(distances=self._distances[:frames]),
             start is None,

@@ -41,6 +41,7 @@ DURATIONS_S = (0.25, 1.0, 3.0)
 OUTLIERS, OUTLIER_MM = 0.02, 8.0
 TAKES = 4  # of each duration and fold
 PAPER = "mean of frames"
+DEFAULT = Energy()
 
 Estimator = Callable[[TongueModel, FloatArray], FloatArray]
 
@@ -51,19 +52,16 @@ def mean_speaker(at_coils: TongueModel, coils: FloatArray) -> FloatArray:
 
 def mean_of_frames(at_coils: TongueModel, coils: FloatArray) -> FloatArray:
     return (
-        FreeSpeakerSolver(at_coils, Energy())
-        .solve_all(coils)
-        .weights[:, : at_coils.speaker.size]
-        .mean(axis=0)
+        FreeSpeakerSolver(at_coils, DEFAULT).solve_all(coils).weights[:, : at_coils.speaker.size].mean(axis=0)
     )
 
 
 def joint(at_coils: TongueModel, coils: FloatArray) -> FloatArray:
-    return estimate_speaker(at_coils, Energy(), coils[::JOINT_SPACING], robust=False).weights
+    return estimate_speaker(at_coils, DEFAULT, coils[::JOINT_SPACING], robust=False).weights
 
 
 def joint_robust(at_coils: TongueModel, coils: FloatArray) -> FloatArray:
-    return estimate_speaker(at_coils, Energy(), coils[::JOINT_SPACING]).weights
+    return estimate_speaker(at_coils, DEFAULT, coils[::JOINT_SPACING]).weights
 
 
 ESTIMATORS: dict[str, Estimator] = {
@@ -109,7 +107,7 @@ def torn(coils: FloatArray, random: np.random.Generator) -> FloatArray:
 
 
 def tracked(
-    model: TongueModel, weights: FloatArray, vertices: list[int], coils: FloatArray, energy: Energy = Energy()
+    model: TongueModel, weights: FloatArray, vertices: list[int], coils: FloatArray, energy: Energy = DEFAULT
 ) -> FloatArray:
     """(frames, V, 3): each frame on its own."""
     speaker = model.for_speaker(weights)
