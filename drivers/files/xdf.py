@@ -166,7 +166,7 @@ def take_times(
     Raises InputError where nothing tells the rate.
     """
     usual_hz = asked_hz or nominal_hz
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(all="ignore"):
         times = stamps - stamps[0]
     if not (np.abs(times) < LONGEST_TAKE_S).all():
         if not usual_hz:
@@ -270,14 +270,14 @@ def _from_stream(
     if stream.count == 0:
         raise InputError(f"{name}: the stream '{stream.name}' has no samples.")
     unit, notes = _unit(stream, coils, name, options.unit)
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(all="ignore"):
         since_first = stream.stamps - stream.stamps[0]
     times, rate_hz, more = frame_times(since_first, name, options.rate_hz, stream.rate_hz or None)
     if stream.rate_hz and not options.rate_hz:
         rate_hz = check_rate(stream.rate_hz, name)
     columns = [column for coil in coils for column in coil.columns]
     values = stream.columns(columns).reshape(stream.count, -1, 3)
-    with np.errstate(over="ignore"):
+    with np.errstate(all="ignore"):  # damage makes any number of a position
         positions, cleaned = clean(values * UNITS_MM[unit])
     if file.damage:
         more.append(f"Damaged or unfinished: {file.damage}.")

@@ -226,11 +226,13 @@ class Take:
         widths = [len(POSE_HEAD), len(info.pose_mean), info.speaker_size, len(info.roles)]
         head, weights, speakers, residuals, _ = np.split(pose[there], np.cumsum(widths), axis=1)
         values = dict(zip(POSE_HEAD, head.T, strict=True))
+        with np.errstate(all="ignore"):  # damage makes any number of a weight
+            normalised = (weights - info.pose_mean) / info.pose_sigma
         return TrackedPoses(
             times_s=times[there],
             statuses=values["status"].astype(np.int64),
             weights=weights,
-            normalised=(weights - info.pose_mean) / info.pose_sigma,
+            normalised=normalised,
             speaker_weights=speakers,
             energies=values["energy"],
             residual_mm=values["residual_mm"],
