@@ -27,6 +27,11 @@ HERE = "here, in a folder of its own, in the order of the page"
 WITH_REFERENCE = "here, where the reference data are"
 ELSEWHERE = "by another test: "
 
+WAVE = ".venv/bin/tonguetrack live rtc3d://192.168.0.10"
+FIRST_TAKE = ".venv/bin/tonguetrack live simulate: --seconds 5 --record first.xdf"
+SIMULATED = ".venv/bin/tonguetrack simulate device "
+BY_FAULTS = ELSEWHERE + "test_cli_live_devices.py and the simulators' own tests: it runs until it is ended"
+
 README = {
     "sudo apt-get install -y python3-venv": BY_CI,
     "python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/tonguetrack demo": BY_CI,
@@ -42,10 +47,37 @@ README = {
     ".venv/bin/tonguetrack track recordings/demo.csv --session session.toml --osc 127.0.0.1:9000 --realtime": HERE,
     ".venv/bin/tonguetrack convert recordings/demo.csv demo.json": HERE,
     ".venv/bin/tonguetrack simulate recording simulated.csv --seconds 4": HERE,
+    ".venv/bin/tonguetrack doctor": ELSEWHERE + "test_doctor.py, where what is found may be anything",
+    ".venv/bin/tonguetrack devices": HERE,
+    WAVE
+    + ' --coils "Sensor 1=tongue_tip,Sensor 2=tongue_blade,Sensor 3=tongue_dorsum" --save-session session.toml': (
+        ELSEWHERE + "test_the_readmes_two_commands_for_a_wave"
+    ),
+    WAVE + " --session session.toml --record take.xdf": ELSEWHERE
+    + "test_the_readmes_two_commands_for_a_wave",
+    FIRST_TAKE: HERE,
+    ".venv/bin/tonguetrack take info first.xdf --check": HERE,
     ".venv/bin/tonguetrack bench": ELSEWHERE + "test_bench.py, with smaller numbers",
 }
 
 DOCS = {
+    FIRST_TAKE: HERE,
+    ".venv/bin/tonguetrack doctor": ELSEWHERE + "test_doctor.py, where what is found may be anything",
+    ".venv/bin/tonguetrack devices": HERE,
+    SIMULATED + "rtc3d --synthetic --sensors 16 --rate 400": BY_FAULTS,
+    SIMULATED + "ndi --from recordings/demo.csv --pty": BY_FAULTS,
+    SIMULATED + "ndi --from recordings/demo.csv --rfc2217": BY_FAULTS,
+    SIMULATED + "carstens --from recordings/demo.csv --layout ag501": BY_FAULTS,
+    SIMULATED
+    + 'rtc3d --synthetic --faults "drop=0.01,dead=tongue_tip@3-5,stall=1@8,disconnect@12"': BY_FAULTS,
+    ".venv/bin/tonguetrack take list .": HERE,
+    ".venv/bin/tonguetrack take info first.xdf --check": HERE,
+    ".venv/bin/tonguetrack take export first.xdf -o first.csv": HERE,
+    ".venv/bin/tonguetrack take export first.xdf --what poses -o poses.csv": HERE,
+    ".venv/bin/tonguetrack take export first.xdf --what session -o first.toml": HERE,
+    '.venv/bin/tonguetrack live "replay:first.xdf?speed=max" --session first.toml': HERE,
+    ".venv/bin/tonguetrack take recover first.xdf -o whole.xdf": ELSEWHERE + "test_cli_take.py: a whole take is refused",
+    "TONGUETRACK_FUZZ=nightly .venv/bin/pytest tests/test_fuzz.py": "by hand, before a release",
     ".venv/bin/tonguetrack info recordings/demo.csv": HERE,
     ".venv/bin/tonguetrack track recordings/demo.csv --out poses.csv --save-session session.toml": HERE,
     ".venv/bin/tonguetrack mesh poses.csv --frame 100 -o tongue.ply": HERE,
@@ -110,6 +142,10 @@ def test_the_flags_that_pages_name_exist():
         "bench",
         "model build",
         "simulate recording",
+        "simulate device",
+        "live",
+        "take info",
+        "take export",
     ):
         done = subprocess.run(
             [tool(), *command.split(), "--help"], capture_output=True, text=True, check=True
@@ -197,6 +233,13 @@ def run_here(page: Path, table: dict[str, str], folder: Path) -> None:
             typed(command.replace(" --realtime", ""), folder)
 
 
+def run_page(page: Path, folder: Path) -> None:
+    """A page of docs, beginning without the takes of the page before: none is ever overwritten."""
+    for take in folder.glob("*.xdf"):
+        take.unlink()
+    run_here(page, DOCS, folder)
+
+
 def test_the_readmes_commands_run_one_after_the_other(newcomer):
     run_here(ROOT / "README.md", README, newcomer)
     for name in ("poses.csv", "session.toml", "poses.npz", "tongue.ply", "demo.json", "simulated.csv"):
@@ -238,7 +281,7 @@ def test_the_docs_commands_run(newcomer):
         if any(DOCS[command] == HERE for command in commands(page)):
             if page.name == "tracking.md":
                 typed(f"{tool()} track recordings/demo.csv --out poses.csv", newcomer)
-            run_here(page, DOCS, newcomer)
+            run_page(page, newcomer)
 
 
 def test_the_docs_programs_run(newcomer):
@@ -339,6 +382,25 @@ def test_the_demo_arrives_at_the_monitor(newcomer):
         monitor.stderr.close()
         monitor.stdout.close()
     assert '"/tongue/pose"' in printed
+
+
+def test_the_readmes_two_commands_for_a_wave(newcomer):
+    """Against a simulated Wave, for some seconds."""
+    wave = subprocess.Popen(
+        [tool(), "simulate", "device", "rtc3d", "--from", "recordings/demo.csv", "--port", "0"],
+        cwd=newcomer, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
+    try:
+        assert wave.stdout is not None
+        address = wave.stdout.readline().strip()
+        both = [command for command in README if command.startswith(WAVE)]
+        for command, seconds in zip(both, ("3 --fix-speaker-after 1", "1"), strict=True):
+            typed(command.replace("rtc3d://192.168.0.10", address) + f" --seconds {seconds}", newcomer)
+    finally:
+        wave.terminate()
+        wave.communicate(timeout=20)
+    assert "[speaker]" in (newcomer / "session.toml").read_text()
+    typed(f"{tool()} take info take.xdf --check", newcomer)
 
 
 def test_the_docs_quote_what_model_info_prints(tmp_path):
