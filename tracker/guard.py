@@ -52,11 +52,16 @@ _ROWS = 16
 
 
 class CoilGuard:
-    """The memory of n coils. states: (n,) `CoilState`; used: (n, 3) the coils that count, NaN otherwise."""
+    """The memory of n coils.
+
+    states: (n,) `CoilState`; used: (n, 3) the coils that count, NaN otherwise; all_counted: whether every coil
+    that was there had a part in the pose.
+    """
 
     def __init__(self, coils: int) -> None:
         self.states: NDArray[np.int64] = np.full(coils, _MISSING, np.int64)
         self.used: FloatArray = np.full((coils, 3), np.nan)
+        self.all_counted = True
         self._memory = np.zeros((_ROWS, coils))
         self.reset()
 
@@ -74,7 +79,7 @@ class CoilGuard:
 
     def admit(self, coils: FloatArray, time_s: float) -> FloatArray:
         """Judges coils (n, 3), mm, NaN = missing, of the moment `time_s`; returns `used`. Nothing is allocated."""
-        _admit(coils, time_s, self._memory, self.states, self.used)
+        self.all_counted = _admit(coils, time_s, self._memory, self.states, self.used)
         return self.used
 
     def learn(self, residuals_mm: FloatArray, time_s: float, step_s: float) -> None:
@@ -83,11 +88,6 @@ class CoilGuard:
         step_s: time since the frame before. Misfits found here lose their say from the next frame on.
         """
         _learn(residuals_mm, time_s, step_s, self._memory, self.states)
-
-    @property
-    def all_counted(self) -> bool:
-        """Whether every coil that was there had a part in the pose."""
-        return bool((self.states <= _MISSING).all())
 
 
 @njit(**OPTIONS)
@@ -108,8 +108,10 @@ def _step_is_possible(
 @njit(**OPTIONS)
 def _admit(
     coils: FloatArray, time_s: float, memory: FloatArray, states: NDArray[np.int64], used: FloatArray
-) -> None:
+) -> bool:
+    """Whether all coils that are there count."""
     n = coils.shape[0]
+    all_counted = True
     for i in range(n):
         if np.isnan(coils[i, 0]):
             states[i] = _MISSING
@@ -160,6 +162,9 @@ def _admit(
                 memory[_KEPT_X + axis, i] = coils[i, axis]
         if counts:
             memory[_KEPT_S, i] = time_s
+        else:
+            all_counted = False
+    return all_counted
 
 
 @njit(**OPTIONS)

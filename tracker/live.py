@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -105,7 +106,7 @@ class LiveRun:
         for sink in self.sinks:
             sink.start(self.info)
         try:
-            with sleeping_collector():
+            with undisturbed():
                 self._loop()
         finally:
             if self.keeper is not None:
@@ -299,10 +300,16 @@ def stream_recording(
         sink.close()
 
 
+SWITCH_S = 0.0005
+"""So long another thread may keep the interpreter from the loop; Python's own choice is ten times as long."""
+
+
 @contextmanager
-def sleeping_collector() -> Iterator[None]:
-    """Collects once, then keeps Python's cyclic garbage collector off; afterwards it is as it was."""
-    was_enabled = gc.isenabled()
+def undisturbed() -> Iterator[None]:
+    """Collects once, then keeps Python's cyclic garbage collector off and other threads short; afterwards all is
+    as it was."""
+    was_enabled, before_s = gc.isenabled(), sys.getswitchinterval()
+    sys.setswitchinterval(min(before_s, SWITCH_S))
     gc.collect()
     frozen_before = gc.get_freeze_count()
     gc.freeze()
@@ -314,6 +321,7 @@ def sleeping_collector() -> Iterator[None]:
             gc.unfreeze()
         if was_enabled:
             gc.enable()
+        sys.setswitchinterval(before_s)
 
 
 def _lateness(source: FrameSource) -> Sequence[int] | None:
