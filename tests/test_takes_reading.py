@@ -266,6 +266,16 @@ def test_markers_know_the_frame_from_which_they_hold(tmp_path):
     assert take.sessions == ((0, INFO.session_toml), (20, "[energy]\nalpha = 2.0\n"))
 
 
+def test_a_marker_whose_time_is_damaged_is_not_lost(tmp_path):
+    rows = rows_of(INFO, 10)
+    for time_s in (np.nan, np.inf):
+        take = read_take(written(tmp_path / "a.xdf", parts_of(INFO, rows, [(time_s, "now"), (5.01, "then")])))
+        assert [(mark.time_s, mark.text) for mark in take.markers] == [
+            (0.0, "now"),
+            (pytest.approx(0.01), "then"),
+        ]
+
+
 # Cut off and damaged --------------------------------------------------------------------------------
 
 
@@ -365,8 +375,8 @@ class Recorded:
                 random.normal(size=(3, 4)), random.normal(size=3), np.arange(3, dtype=np.uint32),
             )  # fmt: skip
             recorder.put(frame, random.normal(size=(2, 3)), pose)
-            if number == 200:
-                recorder.mark("half", time.perf_counter_ns())
+            if number in (200, 390):
+                recorder.mark(f"mark {number}", time.perf_counter_ns())
             if number in (100, 250):
                 while recorder.backlog:  # so that a part is in the file, and a part only in the journal
                     time.sleep(0.005)
@@ -384,6 +394,9 @@ class Recorded:
         return path
 
 
+MARKS = [(201, "mark 200"), (391, "mark 390")]
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     return Recorded(tmp_path_factory.mktemp("recorded"))
@@ -392,15 +405,16 @@ def recorded(tmp_path_factory):
 def test_the_recorders_take_is_complete(recorded):
     take = read_take(recorded.finished)
     assert take.complete and take.frame_count == 400 and take.journal_note == ""
-    assert [mark.row for mark in take.markers] == [201]
+    assert [(mark.row, mark.text) for mark in take.markers] == MARKS
     assert take.recording().frame_numbers.tolist() == list(range(400))
 
 
 def test_the_journal_beside_a_killed_take_gives_its_last_frames(recorded, tmp_path):
     path = recorded.killed_copy(tmp_path)
     take = read_take(path)
-    assert take.state == "unfinished" and "frames were taken from the journal" in take.journal_note
+    assert take.state == "unfinished" and "from the journal" in take.journal_note
     assert_same_frames(take, read_take(recorded.finished))
+    assert [(mark.row, mark.text) for mark in take.markers] == MARKS
     assert open_recording(path).frame_count < 400
 
 
@@ -410,6 +424,7 @@ def test_wherever_a_take_was_cut_its_journal_fills_the_streams_up_to_the_same_fr
     for cut in np.linspace(begin, size, 12).astype(int).tolist():
         take = read_take(recorded.killed_copy(tmp_path, cut))
         assert_same_frames(take, read_take(recorded.finished))
+        assert [(mark.row, mark.text) for mark in take.markers] == MARKS
 
 
 def test_a_journal_of_another_take_or_a_damaged_one_is_left_alone(recorded, tmp_path):
@@ -427,9 +442,9 @@ def test_recovering_gives_the_take_that_would_have_been(recorded, tmp_path):
     before = path.read_bytes()
     said = recover(path, tmp_path / "new.xdf")
     new = read_take(tmp_path / "new.xdf")
-    assert new.complete and [mark.text for mark in new.markers] == ["half"]
+    assert new.complete and new.markers == read_take(recorded.finished).markers
     assert_same_frames(new, read_take(recorded.finished))
-    assert said[0].startswith("400 frames") and "1 mark(s)" in said[0]
+    assert said[0].startswith("400 frames") and "2 mark(s)" in said[0]
     assert path.read_bytes() == before
 
 

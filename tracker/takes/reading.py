@@ -19,8 +19,9 @@ from ...drivers.xdf import XdfFile, XdfStream, map_file, read_xdf
 from ..pose import FloatArray, PoseStatus, TrackedPoses
 from ..setup import MODEL_FRAME
 from .headers import info_from_streams
-from .journal import Rows, journal_path, read_journal
+from .journal import Rows, journal_path, read_journal, read_journal_marks
 from .layout import MARKER_WORDS, MARKERS, POSE, POSE_HEAD, PREPARED, RAW, SESSION_MARK, TakeInfo
+from .marklog import Mark
 
 NUMBERS = (RAW, PREPARED, POSE)
 NS = 1e-9
@@ -63,15 +64,17 @@ class Take:
     """One take. Its arrays have one row a frame, NaN where a stream lacks what another one has.
 
     That happens only where the file was cut between two streams, or is damaged; elsewhere every frame is whole.
-    journal: the rows of the journal beside the take, or None; journal_note: what was found there, "" = nothing.
+    journal, journal_marks: what the journal beside the take holds, None and none without one; journal_note: what
+    the file lacked of it, or why it was not used, "" = nothing.
     Arrays are read from the file when they are asked for.
     """
 
     path: Path
     info: TakeInfo
     file: XdfFile
-    journal: Rows | None
-    journal_note: str
+    journal: Rows | None = None
+    journal_marks: tuple[Mark, ...] = ()
+    journal_note: str = ""
 
     # What state it is in ------------------------------------------------------------------------------
 
@@ -112,6 +115,16 @@ class Take:
             missing = self.journal[self.journal["arrival_ns"] * NS > stream.stamps.max()]
         return missing if len(missing) else None
 
+    def marks_from_journal(self) -> list[Mark]:
+        """The marks that the journal has and the file has not."""
+        stream = self.file.named(MARKERS)
+        if stream is None:
+            return list(self.journal_marks)
+        if self.only_cut_off:  # mark i is sample i
+            return [mark for mark in self.journal_marks if mark.number > stream.count]
+        there = set(stream.stamps.tolist())
+        return [mark for mark in self.journal_marks if mark.stamp_s not in there]
+
     # Frames -------------------------------------------------------------------------------------------
 
     @property
@@ -150,17 +163,18 @@ class Take:
 
     @cached_property
     def markers(self) -> tuple[Marker, ...]:
-        """By time."""
+        """By time; one whose time is damaged stands at the beginning."""
         stream = self.file.named(MARKERS)
-        if stream is None or not stream.texts:
+        texts = [text[0] for text in stream.texts] if stream else []
+        texts += [mark.text for mark in self.marks_from_journal()]
+        at = self.stream_stamps(MARKERS)[: len(texts)]
+        if not texts:
             return ()
-        stamps = self.stamps
-        start_s = float(stamps[0]) if len(stamps) else float(stream.stamps[0])
-        rows = np.searchsorted(stamps, stream.stamps).tolist()
-        found = zip((stream.stamps - start_s).tolist(), rows, stream.texts, strict=True)
-        return tuple(
-            sorted((Marker(t, row, text[0]) for t, row, text in found), key=lambda mark: mark.time_s)
-        )
+        start_s = self.stamps[0] if self.frame_count else at[0]
+        at = np.where(_possible(at), at, start_s)
+        rows = np.searchsorted(self.stamps, at).tolist()
+        found = zip((at - start_s).tolist(), rows, texts, strict=True)
+        return tuple(sorted((Marker(*mark) for mark in found), key=lambda mark: mark.time_s))
 
     @property
     def sessions(self) -> tuple[tuple[int, str], ...]:
@@ -279,7 +293,9 @@ class Take:
         """(rows,) s, of one of the four streams: the file's and then the journal's."""
         stream = self.file.named(name)
         stamps = stream.stamps if stream else np.empty(0)
-        more = self.from_journal(name) if name != MARKERS else None
+        if name == MARKERS:
+            return np.concatenate([stamps, [mark.stamp_s for mark in self.marks_from_journal()]])
+        more = self.from_journal(name)
         return stamps if more is None else np.concatenate([stamps, more["arrival_ns"] * NS])
 
     def _columns(self, name: str, columns: range) -> FloatArray:
@@ -319,18 +335,20 @@ def read_take(path: str | os.PathLike[str]) -> Take:
         raise InputError(f"{path}: {reason}{damage}") from reason
     beside = journal_path(path)
     if not beside.exists():
-        return Take(path, info, file, None, "")
+        return Take(path, info, file)
     try:
-        journal = read_journal(beside, path)
+        journal, marks = read_journal(beside, path), tuple(read_journal_marks(beside, path))
     except InputError as reason:
-        return Take(path, info, file, None, f"The journal beside the take was not used: {reason}")
+        return Take(path, info, file, journal_note=f"The journal beside the take was not used: {reason}")
     if journal.dtype != info.row_dtype():
-        return Take(
-            path, info, file, None, f"The journal beside the take was not used: {beside} has other rows."
-        )
-    take = Take(path, info, file, journal, "")
+        why = f"The journal beside the take was not used: {beside} has rows of other channels."
+        return Take(path, info, file, journal_note=why)
+    take = Take(path, info, file, journal, marks)
     extra = take.frame_count - stream_count(file.named(RAW))
-    note = f"{extra} frames were taken from the journal beside the take." if extra > 0 else ""
+    extra_marks = len(take.marks_from_journal())
+    found = [f"{extra} frame(s)"] if extra > 0 else []
+    found += [f"{extra_marks} mark(s)"] if extra_marks else []
+    note = f"{' and '.join(found)} came from the journal beside the take." if found else ""
     return replace(take, journal_note=note)
 
 

@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 from ... import InputError
 from ...atomic import write_atomically
-from ...drivers.xdf import MAGIC, Buffer, boundary, map_file, samples, stream_footer
+from ...drivers.xdf import MAGIC, Buffer, boundary, map_file, samples, stream_footer, text_samples
 from .headers import missing_headers
 from .layout import MARKERS, STREAM_IDS
 from .reading import NS, NUMBERS, Take, read_take
@@ -20,7 +20,7 @@ ROWS_A_CHUNK = 4096
 def recover(path: str | os.PathLike[str], output: str | os.PathLike[str]) -> tuple[str, ...]:
     """Writes a new, complete take from what is left of one; what was found, in sentences.
 
-    Every whole chunk is copied as it is, the frames that only the journal has follow, then the footers. The old
+    Every whole chunk is copied as it is, the frames and marks that only the journal has follow, then the footers. The old
     file and its journal stay as they are. Raises InputError where `path` is not a take or has no frames, where
     nothing is wrong with it, and where `output` exists.
     """
@@ -59,6 +59,9 @@ def _pieces(take: Take, data: Buffer) -> Iterator[bytes | memoryview]:
         for begin in range(0, len(more), ROWS_A_CHUNK):
             rows = more[begin : begin + ROWS_A_CHUNK]
             yield samples(_stream_id(take, name), rows["arrival_ns"] * NS, rows[name])
+    if marks := take.marks_from_journal():
+        stamps_s, texts = [mark.stamp_s for mark in marks], [mark.text for mark in marks]
+        yield text_samples(_stream_id(take, MARKERS), stamps_s, texts)
     for name in (*NUMBERS, MARKERS):
         stamps = take.stream_stamps(name)
         first, last = (float(stamps[0]), float(stamps[-1])) if len(stamps) else (0.0, 0.0)
@@ -100,7 +103,7 @@ def _sentences(take: Take, recovered: Take) -> tuple[str, ...]:
     elif take.journal is None:
         found.append("There was no journal beside it.")
     else:
-        found.append("The journal beside it had no further frames.")
+        found.append("The journal beside it had nothing more.")
     if recovered.damage:
         found.append(f"What could not be mended: {recovered.damage}.")
     return tuple(found)
