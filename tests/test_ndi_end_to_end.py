@@ -38,7 +38,19 @@ def played(tmp_path_factory):
 @contextmanager
 def simulator(played, *options):
     """The URI of a simulated device in its own process, which has to end well."""
-    command = [sys.executable, "-c", MAIN, "simulate", "device", "ndi", "--from", str(played), *options]
+    command = [
+        sys.executable,
+        "-c",
+        MAIN,
+        "simulate",
+        "device",
+        "ndi",
+        "--from",
+        str(played),
+        "--rate",
+        str(RATE_HZ),
+        *options,
+    ]
     if "--pty" not in options:
         command += ["--port", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

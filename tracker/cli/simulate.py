@@ -17,21 +17,24 @@ PHONES = "ə i ə ɑ ə u ə s a ʃ i ɔ ə"
 COILS = "tongue_tip,tongue_blade,tongue_dorsum"
 SYNTHETIC_S = 20.0
 MOST_SENSORS = 256
+POLARIS_HZ = 60.0
 
 
 @dataclass(frozen=True)
 class SimulatedDevice:
-    """port, rate_hz: the usual ones; options: those that this kind alone has."""
+    """port, rate_hz: the usual ones; own_pace: whether it measures at that rate whatever it is given to play;
+    options: those that this kind alone has."""
 
     port: int
     rate_hz: float
+    own_pace: bool
     options: tuple[str, ...]
 
 
 DEVICES = {
-    "rtc3d": SimulatedDevice(3030, 400.0, ("nul", "missing")),
-    "ndi": SimulatedDevice(8765, 40.0, ("pty", "rfc2217", "model")),
-    "carstens": SimulatedDevice(30303, 250.0, ("layout",)),
+    "rtc3d": SimulatedDevice(3030, 400.0, False, ("nul", "missing")),
+    "ndi": SimulatedDevice(8765, 40.0, True, ("pty", "rfc2217", "model")),
+    "carstens": SimulatedDevice(30303, 250.0, False, ("layout",)),
 }
 
 
@@ -89,7 +92,7 @@ def _add_device(kinds: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help=f"plays a synthetic speaker ({SYNTHETIC_S:g} s, over and over)",
     )
     device.add_argument("--rate", type=float, metavar="HZ",
-                        help="frames a second of the device (default: the file's; synthetic: the usual ones)")  # fmt: skip
+                        help="frames a second (default: the file's, NDI's own 40 or 60, and with --synthetic the usual ones)")  # fmt: skip
     device.add_argument(
         "--coils", metavar="ROLE,...", help=f"with --synthetic: where coils sit (default: {COILS})"
     )
@@ -149,7 +152,7 @@ def run_device(args: argparse.Namespace) -> int:
     recording = _synthetic(args) if args.synthetic else _opened(args)
     if args.sensors is not None:
         recording = _with_sensors(recording, args.sensors)
-    motion = SimulatedMotion(recording, args.rate)
+    motion = SimulatedMotion(recording, _pace_hz(args))
     plan = parse_faults(args.faults, motion.coils)
     port = DEVICES[args.device].port if args.port is None else args.port
 
@@ -191,6 +194,15 @@ def run_device(args: argparse.Namespace) -> int:
     finally:
         signal.signal(signal.SIGTERM, before)
     return 0
+
+
+def _pace_hz(args: argparse.Namespace) -> float | None:
+    """What the device measures at; None = as fast as its recording."""
+    return args.rate or (_usual_rate_hz(args) if DEVICES[args.device].own_pace else None)
+
+
+def _usual_rate_hz(args: argparse.Namespace) -> float:
+    return POLARIS_HZ if args.model == "polaris" else DEVICES[args.device].rate_hz
 
 
 def _interrupt(signum: int, frame: object) -> None:
@@ -242,7 +254,7 @@ def _synthetic(args: argparse.Namespace) -> Recording:
             phones=tuple(PHONES.split()),
             coils=tuple(role for role in roles.replace(" ", "").split(",") if role),
             seconds=SYNTHETIC_S,
-            rate_hz=args.rate or DEVICES[args.device].rate_hz,
+            rate_hz=args.rate or _usual_rate_hz(args),
             seed=1 if args.seed is None else args.seed,
         )
     )
