@@ -33,7 +33,6 @@ from .session import Energy
 RELATIVE_DECREASE = 1e-11  # a step that promises less of f than this is not taken
 MAX_STEPS = 200  # each descent of ordinary speech takes 3 to 10
 SHORTEST_STEP = 1e-9
-EXACT, GAUSS_NEWTON, POSES_HELD = 0, 1, 2
 
 REWEIGHTINGS = 3
 # The distance at which a sample's weight is 1/2, in medians of all samples' distances. On real speakers left out of
@@ -247,56 +246,70 @@ def solve_poses(problem: Problem, state: State, work: Work) -> float:
 
 
 @njit(**OPTIONS)
-def reduce_to_speaker(problem: Problem, state: State, work: Work, kind: int) -> float:
-    """Half the gradient and half the Hessian of f at the state, whose poses must be solved.
-
-    kind: EXACT; GAUSS_NEWTON, without the bilinear term, never indefinite; POSES_HELD, those of F(., p) with the
-    poses where they are, which is quadratic. Returns how many weights of the poses the coils determine: one each
-    that the data hold, none each that the bias or nothing holds.
-    """
-    speakers, size, rows = problem.core.shape
-    determined = 0.0
-    for a in range(speakers):
+def _clear_system(problem: Problem, state: State, work: Work) -> None:
+    """Sets the reduced system to the speaker's bias alone."""
+    for a in range(state.speaker.shape[0]):
         work.gradient[a] = problem.terms[2] * (state.speaker[a] - problem.speaker_box[0, a])
-        for b in range(speakers):
+        for b in range(state.speaker.shape[0]):
             work.hessian[a, b] = 0.0
         work.hessian[a, a] = problem.terms[2]
+
+
+@njit(**OPTIONS)
+def _add_frame(problem: Problem, state: State, work: Work, frame: int, share: float, bilinear: float) -> None:
+    """Adds half the derivatives in s of one frame's terms, its pose held, to the lower half of the reduced system,
+    and sets work.cross to half the mixed ones; bilinear: the share of v's own second derivative in them."""
+    speakers, size, rows = problem.core.shape
+    _set_residual(problem, state, work, frame)
+    for l in range(speakers):
+        for row in range(rows):
+            work.slopes[l, row] = 0.0
+        for k in range(size):
+            work.cross[l, k] = 0.0
+            pose_weight = state.poses[frame, k]
+            for row in range(rows):
+                work.slopes[l, row] += pose_weight * problem.core[l, k, row]
+    for i in range(problem.coils.shape[1]):
+        if np.isnan(problem.coils[frame, i, 0]):
+            continue
+        factor = share * state.trust[frame, i]
+        for row in range(3 * i, 3 * i + 3):
+            pull = factor * work.residual[row]
+            bend = bilinear * pull
+            for l in range(speakers):
+                slope = factor * work.slopes[l, row]
+                work.gradient[l] += pull * work.slopes[l, row]
+                for b in range(l + 1):
+                    work.hessian[l, b] += slope * work.slopes[b, row]
+                for k in range(size):
+                    work.cross[l, k] += slope * work.directions[k, row] + bend * problem.core[l, k, row]
+
+
+@njit(**OPTIONS)
+def reduce_to_speaker(problem: Problem, state: State, work: Work, bilinear: float) -> float:
+    """Half the gradient and half the Hessian of f at the state, whose poses must be solved.
+
+    bilinear: 1.0 for the exact Hessian; 0.0 for Gauss-Newton's, which is never indefinite. Returns how many weights
+    of the poses the coils determine: one each that the data hold, none each that the bias or nothing holds.
+    """
+    determined = 0.0
+    _clear_system(problem, state, work)
     for frame in range(problem.coils.shape[0]):
         present = _present(problem.coils, frame)
-        if present == 0:
-            continue
-        share = problem.terms[0] / present
-        if kind != POSES_HELD:
+        if present > 0:
+            share = problem.terms[0] / present
             _set_pose_hessian(problem, state, work, frame, share)
-        _set_residual(problem, state, work, frame)
-        for l in range(speakers):
-            for row in range(rows):
-                work.slopes[l, row] = 0.0
-            for k in range(size):
-                work.cross[l, k] = 0.0
-                pose_weight = state.poses[frame, k]
-                for row in range(rows):
-                    work.slopes[l, row] += pose_weight * problem.core[l, k, row]
-        for i in range(problem.coils.shape[1]):
-            if np.isnan(problem.coils[frame, i, 0]):
-                continue
-            factor = share * state.trust[frame, i]
-            for row in range(3 * i, 3 * i + 3):
-                pull = factor * work.residual[row]
-                bend = pull if kind == EXACT else 0.0
-                for l in range(speakers):
-                    slope = factor * work.slopes[l, row]
-                    work.gradient[l] += pull * work.slopes[l, row]
-                    for b in range(l + 1):
-                        work.hessian[l, b] += slope * work.slopes[b, row]
-                    for k in range(size):
-                        work.cross[l, k] += slope * work.directions[k, row] + bend * problem.core[l, k, row]
-        if kind != POSES_HELD:
+            _add_frame(problem, state, work, frame, share, bilinear)
             determined += _eliminate_pose(problem, state, work, frame)
-    for a in range(speakers):
-        for b in range(a):
-            work.hessian[b, a] = work.hessian[a, b]
+    _mirror_lower_half(work.hessian)
     return determined
+
+
+@njit(**OPTIONS)
+def _mirror_lower_half(matrix: FloatArray) -> None:
+    for a in range(matrix.shape[0]):
+        for b in range(a):
+            matrix[b, a] = matrix[a, b]
 
 
 @njit(**OPTIONS)
@@ -381,34 +394,37 @@ def _set_target(problem: Problem, state: State, work: Work) -> float:
 def _descend(problem: Problem, state: State, work: Work) -> tuple[float, int, bool]:
     """Minimises f from the state's speaker, in place. Returns f, how many steps, whether it came to rest."""
     speakers = state.speaker.shape[0]
+    energy = np.inf
+    slope = 0.0
     for l in range(speakers):
-        state.speaker[l] = min(max(state.speaker[l], problem.speaker_box[1, l]), problem.speaker_box[2, l])
-    energy = solve_poses(problem, state, work)
-    for step in range(MAX_STEPS):
-        reduce_to_speaker(problem, state, work, EXACT)
-        promised = _set_target(problem, state, work)
-        if promised < 0.0:
-            reduce_to_speaker(problem, state, work, GAUSS_NEWTON)
-            promised = _set_target(problem, state, work)
-        if not promised > RELATIVE_DECREASE * energy:
-            return energy, step, promised > -np.inf  # nor is it so where the energy is not a number
-        slope = 0.0
+        work.target[l] = state.speaker[l]
+    for step in range(MAX_STEPS + 1):
         for l in range(speakers):
             work.before[l] = state.speaker[l]
-            slope += 2.0 * work.gradient[l] * (work.target[l] - state.speaker[l])
         length = 1.0
         reached = np.inf
-        while length > SHORTEST_STEP and not reached <= energy + 1e-4 * length * slope:
+        while True:
             for l in range(speakers):
                 moved = work.before[l] + length * (work.target[l] - work.before[l])
                 state.speaker[l] = min(max(moved, problem.speaker_box[1, l]), problem.speaker_box[2, l])
             reached = solve_poses(problem, state, work)
+            if reached <= energy + 1e-4 * length * slope or length < SHORTEST_STEP:
+                break
             length *= 0.5
-        if not reached < energy:  # nothing is lower by more than rounding
-            for l in range(speakers):
-                state.speaker[l] = work.before[l]
-            return solve_poses(problem, state, work), step, True
+        if not reached < energy:  # nothing is lower by more than rounding, or the energy is not a number
+            return reached, step, np.isfinite(reached)
         energy = reached
+        promised = -np.inf
+        for attempt in range(2):
+            reduce_to_speaker(problem, state, work, 1.0 - attempt)
+            promised = _set_target(problem, state, work)
+            if promised >= 0.0:
+                break
+        if not promised > RELATIVE_DECREASE * energy:
+            return energy, step, promised > -np.inf
+        slope = 0.0
+        for l in range(speakers):
+            slope += 2.0 * work.gradient[l] * (work.target[l] - state.speaker[l])
     return energy, MAX_STEPS, False
 
 
@@ -460,7 +476,12 @@ def _start_from(attempt: int, problem: Problem, state: State, work: Work) -> Non
         state.speaker[l] = min(max(work.ends[0, l], low), high)
     if attempt > 0:
         _set_directions(problem, state, work)
-        reduce_to_speaker(problem, state, work, POSES_HELD)
+        _clear_system(problem, state, work)
+        for frame in range(state.poses.shape[0]):
+            present = _present(problem.coils, frame)
+            if present > 0:
+                _add_frame(problem, state, work, frame, problem.terms[0] / present, 0.0)
+        _mirror_lower_half(work.hessian)
         if _set_target(problem, state, work) > 0.0:
             for l in range(state.speaker.shape[0]):
                 state.speaker[l] = problem.flips[attempt - 1, l] * work.target[l]
@@ -482,25 +503,26 @@ def estimate(problem: Problem, state: State, work: Work, first: bool, reweightin
             state.trust[frame, i] = 1.0
     for l in range(speakers):
         work.ends[0, l] = state.speaker[l]
+    attempts = 1 + (problem.flips.shape[0] if first else 1)
     lowest = np.inf
+    energy = np.inf
     steps = 0
-    for attempt in range(1 + (problem.flips.shape[0] if first else 1)):
-        _start_from(attempt, problem, state, work)
+    at_rest = False
+    for descent in range(attempts + 1 + reweightings):
+        if descent < attempts:
+            _start_from(descent, problem, state, work)
+        elif descent == attempts:
+            for l in range(speakers):
+                state.speaker[l] = work.ends[1, l]
+        else:
+            _reweigh(state, work)
         energy, more, at_rest = _descend(problem, state, work)
         steps += more
-        if attempt == 0 or energy < lowest * (1.0 - 1e-9):
+        if descent == 0 or (descent < attempts and energy < lowest * (1.0 - 1e-9)):
             lowest = energy
             for l in range(speakers):
                 work.ends[1, l] = state.speaker[l]
-    for l in range(speakers):
-        state.speaker[l] = work.ends[1, l]
-    energy, more, at_rest = _descend(problem, state, work)
-    steps += more
-    for _ in range(reweightings):
-        _reweigh(state, work)
-        energy, more, at_rest = _descend(problem, state, work)
-        steps += more
-    determined = reduce_to_speaker(problem, state, work, GAUSS_NEWTON) + speakers
+    determined = reduce_to_speaker(problem, state, work, 0.0) + speakers
     frames = 0
     samples = 0
     distance = 0.0
