@@ -170,7 +170,8 @@ class Take:
         at = self.stream_stamps(MARKERS)[: len(texts)]
         if not texts:
             return ()
-        start_s = self.stamps[0] if self.frame_count else at[0]
+        possible = at[_possible(at)]
+        start_s = [*self.stamps[:1], *possible[:1], 0.0][0]
         at = np.where(_possible(at), at, start_s)
         rows = np.searchsorted(self.stamps, at).tolist()
         found = zip((at - start_s).tolist(), rows, texts, strict=True)
