@@ -30,7 +30,7 @@ from tonguetrack.tracker.session import Energy
 from tonguetrack.tracker.setup import Setup
 from tonguetrack.tracker.status import LiveStatus
 from tonguetrack.tracker.streams.osc import OscSink
-from tonguetrack.tracker.streams.sink import StreamInfo
+from tonguetrack.tracker.streams.sink import Sink, StreamInfo
 
 
 class Listener:
@@ -111,7 +111,7 @@ def one_turn(
 ) -> LiveStatus:
     tracker = Tracker(model, setup, source.rate_hz)
     osc = OscSink(f"127.0.0.1:{port}")
-    sinks = [osc, Listener(tracker, speaker)] if speaker else [osc]
+    sinks: list[Sink] = [osc, Listener(tracker, speaker)] if speaker else [osc]
     info = stream_info(model, setup, source.rate_hz)
     status = LiveStatus(info.roles, sinks)
     try:

@@ -1,10 +1,11 @@
 """How well a speaker whom the model has never seen is known after some seconds of speech, by each estimator.
 
-    python tests/bench/speaker_estimates.py PATH/sampleDatabase.yaml [--coils 3|5] [--noise 0.3] [--region FILE.json]
+    python tests/bench/speaker_estimates.py PATH/sampleDatabase.yaml [--coils 3|5] [--noise 0.3] [--outlier-mm 8]
+        [--region FILE.json]
 
 Leaves one speaker out at a time. That speaker's true meshes, moved smoothly from phone to phone, carry three
 coils along the mid-sagittal plane, or two more at the sides, with noise (mm, each coordinate) at 250 Hz. From 0.25, 1
-and 3 s of it the speaker is estimated, also with 2 % of the coils' samples torn 8 mm away; then the speaker is
+and 3 s of it the speaker is estimated, also with 2 % of the coils' samples torn away by --outlier-mm; then the speaker is
 fixed and each true phone tracked from undisturbed coils. Prints the mean distance in mm between tracked and true
 vertices over all folds, with its standard error over the folds, and the mean difference to the paper's estimator in
 the same folds with its own: over the whole mesh, and over the vertices {"indices": [...]} of the region's file.
@@ -38,7 +39,7 @@ BESIDE_MM = 10.0
 RATE_HZ, PHONE_S, MOVING_SHARE = 250.0, 0.15, 0.7
 JOINT_SPACING = 5  # frames: 20 ms, as while tracking
 DURATIONS_S = (0.25, 1.0, 3.0)
-OUTLIERS, OUTLIER_MM = 0.02, 8.0
+OUTLIERS = 0.02
 TAKES = 4  # of each duration and fold
 PAPER = "mean of frames"
 DEFAULT = Energy()
@@ -100,9 +101,9 @@ def speech(places: FloatArray, seconds: float, random: np.random.Generator) -> F
     return places[order[index]] * (1 - share) + places[order[index + 1]] * share
 
 
-def torn(coils: FloatArray, random: np.random.Generator) -> FloatArray:
+def torn(coils: FloatArray, far_mm: float, random: np.random.Generator) -> FloatArray:
     away = random.normal(size=coils.shape)
-    away *= OUTLIER_MM / np.linalg.norm(away, axis=2, keepdims=True)
+    away *= far_mm / np.linalg.norm(away, axis=2, keepdims=True)
     return coils + away * (random.random(coils.shape[:2]) < OUTLIERS)[:, :, None]
 
 
@@ -132,6 +133,7 @@ def main() -> None:
     parser.add_argument("database")
     parser.add_argument("--coils", type=int, choices=(3, 5), default=3)
     parser.add_argument("--noise", type=float, default=0.3)
+    parser.add_argument("--outlier-mm", type=float, default=8.0)
     parser.add_argument("--region")
     args = parser.parse_args()
     region = json.loads(Path(args.region).read_text())["indices"] if args.region else None
@@ -139,19 +141,19 @@ def main() -> None:
         list
     )  # a value per part in every fold
     for fold, (model, truth) in enumerate(folds(load_training_shapes(read_sample_database(args.database)))):
-        for row, values in fold_errors(model, truth, args.coils, args.noise, region, fold).items():
+        for row, values in fold_errors(model, truth, args, region, fold).items():
             errors[row].append(values)
     print_table(errors, ["whole mesh", "region"] if region else ["whole mesh"])
 
 
 def fold_errors(
-    model: TongueModel, truth: FloatArray, coil_count: int, noise: float, region: list[int] | None, seed: int
+    model: TongueModel, truth: FloatArray, args: argparse.Namespace, region: list[int] | None, seed: int
 ) -> dict[tuple[str, str], tuple[float, ...]]:
     """(condition, estimator) -> mean distance over the whole mesh and, if there is one, over the region."""
     random = np.random.default_rng(seed)
-    vertices = coil_vertices(model, coil_count)
+    vertices = coil_vertices(model, args.coils)
     at_coils = model.at(vertices)
-    heard = truth[:, vertices] + random.normal(0, noise, (len(truth), coil_count, 3))
+    heard = truth[:, vertices] + random.normal(0, args.noise, (len(truth), args.coils, 3))
 
     def distances(meshes: FloatArray) -> tuple[float, ...]:
         apart = np.linalg.norm(meshes - truth, axis=2)
@@ -166,8 +168,11 @@ def fold_errors(
         taken = defaultdict(list)
         for _ in range(TAKES):
             clean = speech(truth[:, vertices], seconds, random)
-            clean = clean + random.normal(0, noise, clean.shape)
-            for name, coils in ((f"{seconds:g} s", clean), (f"{seconds:g} s, outliers", torn(clean, random))):
+            clean = clean + random.normal(0, args.noise, clean.shape)
+            for name, coils in (
+                (f"{seconds:g} s", clean),
+                (f"{seconds:g} s, outliers", torn(clean, args.outlier_mm, random)),
+            ):
                 for estimator, function in ESTIMATORS.items():
                     weights = function(at_coils, coils)
                     taken[name, estimator].append(distances(tracked(model, weights, vertices, heard)))
