@@ -133,6 +133,13 @@ def test_an_error_says_what_its_number_means():
         ndi.parse_reply(ndi.error_reply(0xF7))
 
 
+def test_a_status_can_be_read():
+    assert ndi.status_words(0x00000171, ndi.PORT_STATUS) == (
+        "occupied, initialised, enabled, out of volume, sensor broken"
+    )
+    assert ndi.status_words(0, ndi.SYSTEM_STATUS) == ""
+
+
 def test_a_list_of_handles_comes_with_their_status():
     handles = ndi.parse_phsr("030A01F0B01F0C001")
     assert handles == (ndi.PortHandle(10, 0x1F), ndi.PortHandle(11, 0x1F), ndi.PortHandle(12, 1))
@@ -538,3 +545,13 @@ def test_a_body_with_right_crcs_may_hold_anything(body, options):
         ndi.parse_bx(data, options)
     except ndi.NdiDamaged:
         pass
+
+
+def test_a_reply_of_the_right_length_with_a_wrong_crc_is_told_without_waiting_for_more():
+    for place in range(6, len(ONE_VALID)):
+        damaged = bytearray(ONE_VALID)
+        damaged[place] = 0x0D if damaged[place] != 0x0D else 0x0A
+        reader = ndi.ReplyReader()
+        reader.feed(bytes(damaged))
+        assert reader.next() == ndi.Damage(len(ONE_VALID))
+        assert not reader.pending

@@ -537,6 +537,14 @@ def test_goodbye_ends_soon_where_the_device_is_mute(serial):
     assert serial.opened[0].closed
 
 
+def test_a_new_bit_of_the_system_status_is_told_once(serial):
+    bad = [ndi.encode_bx(TrackingReply(m, system_status=0x0012), 0x0801) for m in moving(16, 24)]
+    with serial(Device(measurements=[*moving(8), *bad, *moving(32, 40)]), "?baud=9600") as source:
+        items = items_of(source, 5)
+    told = [text for text in texts_of(items, NoteKind.INFO) if "system status" in text]
+    assert told == ["the device's system status: too much interference, hardware failure"]
+
+
 def test_a_port_that_is_pulled_out_is_told(serial, monkeypatch):
     device = Device(measurements=moving(8, 16))
     with serial(device, "?baud=9600") as source:

@@ -73,6 +73,13 @@ SYSTEM_STATUS = {
     0x0040: "a tool was plugged in",
     0x0080: "a tool was unplugged",
 }
+
+
+def status_words(status: int, table: dict[int, str]) -> str:
+    """What the set bits of a port or system status mean, with commas between."""
+    return ", ".join(words for bit, words in table.items() if status & bit)
+
+
 ERRORS = {
     0x01: "the command is unknown",
     0x02: "the command is too long",
@@ -100,7 +107,7 @@ ERRORS = {
     0x2C: "the port handle is empty: its tool was unplugged",
 }
 """What ERRORxx means."""
-UNKNOWN_COMMAND, BAD_CRC, WRONG_PARAMETER, WRONG_HANDLE, WRONG_MODE = 0x01, 0x04, 0x07, 0x08, 0x0C
+UNKNOWN_COMMAND, BAD_CRC, WRONG_MODE = 0x01, 0x04, 0x0C
 
 
 class NdiError(ValueError):
@@ -659,6 +666,7 @@ class ReplyReader:
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._bad = 0
+        self._bad_record = 0  # where the bad bytes began with a good header: the size that it gave
         self._ready: list[Reply] = []
         self._allowance = 0  # bytes of failed bodies that may still be looked through again
 
@@ -695,18 +703,23 @@ class ReplyReader:
                 return self._ready.pop(0)
             size = self._step()
             if size == 0:
-                return None
+                if not self._bad_record or self._bad + len(self._buffer) != self._bad_record:
+                    return None
+                # One record of the right length and a wrong CRC is all that has come: nothing else begins in it.
+                self._bad += len(self._buffer)
+                self._buffer.clear()
+                return self._damage()
             if self._ready:
                 del self._buffer[:size]
                 continue
-            ends_line = self._buffer[size - 1] == 0x0D
             self._bad += size
+            ends_line = self._buffer[size - 1] == 0x0D and self._bad >= self._bad_record
             del self._buffer[:size]
             if ends_line or self._bad > MAX_TEXT:
                 return self._damage()
 
     def _damage(self) -> Damage:
-        damage, self._bad = Damage(self._bad), 0
+        damage, self._bad, self._bad_record = Damage(self._bad), 0, 0
         return damage
 
     def _step(self) -> int:
@@ -737,6 +750,8 @@ class ReplyReader:
             self._ready.append(Reply(record))
             return size
         # Where a byte was lost, the next reply begins inside what the header claims.
+        if not self._bad:
+            self._bad_record = size
         self._allowance -= size
         return 1 if self._allowance >= 0 else size
 

@@ -381,6 +381,7 @@ class NdiConversation:
         self._frame_s = 0.0
         self._period_s = 0.0
         self._bad = 0
+        self._system_status = 0
 
     def receive(self, timeout_s: float) -> CoilFrame | SourceNote | None:
         """See `source.Conversation`."""
@@ -488,6 +489,11 @@ class NdiConversation:
 
     def _take(self, tracking: ndi.TrackingReply, arrival_ns: int) -> CoilFrame | None:
         """The frame, or None where nothing new was measured; then the device is spared for a moment."""
+        if tracking.system_status != self._system_status:
+            words = ndi.status_words(tracking.system_status & ~self._system_status, ndi.SYSTEM_STATUS)
+            self._system_status = tracking.system_status
+            if words:
+                self._notes.append(_info(f"the device's system status: {words}"))
         newest = -1
         for tool in tracking.tools:
             if tool.handle in self._index and tool.state in (ndi.State.VALID, ndi.State.MISSING):
