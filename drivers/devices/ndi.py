@@ -646,7 +646,7 @@ class Damage:
 
 
 MAX_TEXT = 1 << 16
-MAX_BUFFER = 2 * MAX_TEXT
+MAX_BUFFER = 3 * MAX_TEXT  # the longest reply, all but its last byte, and as much again from one read
 _TEXT_BYTES = frozenset(range(0x20, 0x7F)) | {0x09, 0x0A}
 _NOT_TEXT = re.compile(rb"[^\t\n\x20-\x7e]")
 _KNOWN_STARTS = re.compile(rb"OKAY|ERROR|RESET")

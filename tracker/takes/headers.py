@@ -38,7 +38,7 @@ def info_from_streams(streams: Sequence[XdfStream]) -> TakeInfo:
         raise InputError(f"the take has version {words[TAKE_MARK]!r}; this tonguetrack reads {TAKE_VERSION}.")
     try:
         info = _info_from(words, raw)
-    except (KeyError, TypeError, ValueError, RecursionError) as reason:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as reason:
         raise InputError(
             f"the take's description is damaged ({type(reason).__name__}: {str(reason)[:80]})."
         ) from reason
@@ -113,7 +113,7 @@ def _info_from(words: Any, raw: XdfStream) -> TakeInfo:
         rms=rms,
         status=status,
         roles=_texts(words["roles"]),
-        vertices=tuple(int(vertex) for vertex in json.loads(words["vertices"])),
+        vertices=tuple(_small(vertex, 10**9) for vertex in json.loads(words["vertices"])),
         model_name=words["model_name"],
         model_fingerprint=words["model_fingerprint"],
         pose_mean=_numbers(words["pose_mean"]),
@@ -139,10 +139,10 @@ def _numbers(text: str) -> np.ndarray:
     return values
 
 
-def _small(text: str) -> int:
+def _small(text: str | int, most: int = 10_000) -> int:
     value = int(text)
-    if not 0 <= value <= 10_000:
-        raise ValueError(f"{value} speaker weights")
+    if not 0 <= value <= most:
+        raise ValueError(f"{str(value)[:20]} where a number up to {most} is expected")
     return value
 
 

@@ -215,8 +215,9 @@ def _header(data: bytes, size: int, name: str) -> JournalHeader:
     if version != VERSION:
         raise InputError(f"{name}: a journal of version {version}; this program reads version {VERSION}.")
     header = JournalHeader((raw, prepared, pose), slots, take_bytes, digest)
-    fits = slots > 0 and size <= header.file_bytes <= MAX_BYTES and take_bytes <= MAX_TAKE_HEADER_BYTES
-    if max(header.channels) > MAX_CHANNELS or not fits:
+    fits = max(header.channels) <= MAX_CHANNELS  # else numpy has no such row
+    fits = fits and slots > 0 and size <= header.file_bytes <= MAX_BYTES
+    if not fits or take_bytes > MAX_TAKE_HEADER_BYTES:
         raise InputError(f"{name}: {size} bytes do not fit {slots} rows of {header.channels} channels.")
     return header
 
