@@ -36,7 +36,7 @@ SHORTEST_STEP = 1e-9
 
 REWEIGHTINGS = 3
 # The distance at which a sample's weight is 1/2, in medians of all samples' distances. On real speakers left out of
-# the model, 5 costs clean speech nothing measurable, and samples 50 mm astray hardly tell; 3 costs a little.
+# the model, 5 costs clean speech nothing measurable, and samples 50 mm astray do not tell; 3 costs a little.
 OUTLIER_MEDIANS = 5.0
 
 # With a smaller share of the coordinates left over, the poses follow the coils wherever they are.
@@ -493,7 +493,7 @@ def estimate(problem: Problem, state: State, work: Work, first: bool, reweightin
 
     F has several minima, because signs can change in pairs (`sign_flips`). It descends from the start and from the
     speaker of the mean pose (`_start_from`), where no sign has changed; the first time from its flips too. The
-    lowest end is kept.
+    lowest end is kept, and compared once more when the trust was taken for the first time.
     reweightings: how often the trust is taken anew from the distances, and f minimised again. Leaves half the
     Gauss-Newton Hessian of f in work.hessian.
     """
@@ -501,27 +501,29 @@ def estimate(problem: Problem, state: State, work: Work, first: bool, reweightin
     for frame in range(state.trust.shape[0]):
         for i in range(state.trust.shape[1]):
             state.trust[frame, i] = 1.0
-    for l in range(speakers):
-        work.ends[0, l] = state.speaker[l]
     attempts = 1 + (problem.flips.shape[0] if first else 1)
     lowest = np.inf
     energy = np.inf
     steps = 0
     at_rest = False
-    for descent in range(attempts + 1 + reweightings):
-        if descent < attempts:
-            _start_from(descent, problem, state, work)
-        elif descent == attempts:
-            for l in range(speakers):
-                state.speaker[l] = work.ends[1, l]
-        else:
+    for turn in range(1 + reweightings):
+        if turn > 0:
             _reweigh(state, work)
-        energy, more, at_rest = _descend(problem, state, work)
-        steps += more
-        if descent == 0 or (descent < attempts and energy < lowest * (1.0 - 1e-9)):
-            lowest = energy
-            for l in range(speakers):
-                work.ends[1, l] = state.speaker[l]
+        for l in range(speakers):
+            work.ends[0, l] = state.speaker[l]
+        starts = attempts if turn < 2 else 0  # outliers may have had a say in which end was lowest
+        for attempt in range(starts + 1):
+            if attempt < starts:
+                _start_from(attempt, problem, state, work)
+            elif starts > 0:
+                for l in range(speakers):
+                    state.speaker[l] = work.ends[1, l]
+            energy, more, at_rest = _descend(problem, state, work)
+            steps += more
+            if attempt == 0 or (attempt < starts and energy < lowest * (1.0 - 1e-9)):
+                lowest = energy
+                for l in range(speakers):
+                    work.ends[1, l] = state.speaker[l]
     determined = reduce_to_speaker(problem, state, work, 0.0) + speakers
     frames = 0
     samples = 0
