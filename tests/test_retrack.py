@@ -1,5 +1,6 @@
 """A take gives the same bits again: with bad coils, gaps, a speaker that becomes known, a clock that jumps."""
 
+import threading
 import time
 from dataclasses import replace
 
@@ -175,6 +176,71 @@ def test_a_take_that_begins_in_the_middle_of_a_run_gives_the_same_bits_too(small
     assert numbers[0] == 102
     assert set(range(102, 502)) <= set(numbers.tolist()) <= set(range(102, 504))
     assert [mark.text for mark in found.markers] == ["vowels begin"]
+    assert retrack(found, small_model).same
+
+
+def test_a_speaker_that_becomes_known_between_frames_of_one_packet_is_in_its_place(
+    small_model, take, tmp_path
+):
+    recording, setup = take
+    free = replace(setup, session=replace(setup.session, speaker_weights=None))
+    items = frames_of(recording, range(200))
+    items = [replace(frame, arrival_ns=items[k - k % 8].arrival_ns) for k, frame in enumerate(items)]
+    found = recorded(small_model, free, items, recording.coils, tmp_path, fix_after_s=0.4)
+    row = int(np.argmax(found.pose[:, found.info.pose_labels.index("speaker_fixed")]))
+    assert row % 8 != 0
+    assert [row_of for row_of, _ in found.sessions] == [0, row]
+    assert retrack(found, small_model).same
+
+
+def test_a_speaker_that_becomes_known_while_the_takes_file_is_made_is_part_of_the_take(
+    small_model, take, tmp_path
+):
+    recording, setup = take
+    free = replace(setup, session=replace(setup.session, speaker_weights=None))
+    tracker = Tracker(small_model, free, RATE_HZ, watchful=True)
+    described, go_on = threading.Event(), threading.Event()
+
+    def describe(frame):
+        info = take_info(source, frame, small_model, tracker.setup, RATE_HZ)
+        described.set()
+        assert go_on.wait(10.0)
+        return info
+
+    def the_file_is_there():
+        go_on.set()
+        keeper.wait()
+
+    controls = ControlQueue()
+    items = [
+        *frames_of(recording, range(50)),
+        lambda: controls.put(Control("take_start", "late", time.perf_counter_ns())),
+        *frames_of(recording, range(50, 51)),
+        lambda: described.wait(10.0),
+        lambda: controls.put(Control("fix_speaker", "", time.perf_counter_ns())),
+        *frames_of(recording, range(51, 60)),
+        the_file_is_there,
+        *frames_of(recording, range(60, 120)),
+    ]
+    source = Script(recording.coils, items)
+    keeper = TakeKeeper(tmp_path, describe)
+    info = stream_info(small_model, free, RATE_HZ)
+    LiveRun(source, tracker, info, LiveStatus(setup.roles), keeper=keeper, controls=controls).run()
+    found = read_take(tmp_path / "late.xdf")
+    assert found.frame_count == 60
+    assert retrack(found, small_model).same
+
+
+def test_a_users_mark_that_looks_like_a_set_up_is_none(small_model, take, tmp_path):
+    recording, setup = take
+    controls = ControlQueue()
+    items = [
+        *frames_of(recording, range(20)),
+        lambda: controls.put(Control("mark", "session: two", time.perf_counter_ns())),
+        *frames_of(recording, range(20, 40)),
+    ]
+    found = recorded(small_model, setup, items, recording.coils, tmp_path, controls=controls)
+    assert [mark.text for mark in found.markers] == ["mark: session: two"]
     assert retrack(found, small_model).same
 
 

@@ -21,7 +21,7 @@ from .setup import Setup
 from .status import LiveStatus, Summary, summarise
 from .streams.osc import OscSink
 from .streams.sink import Sink, StreamInfo
-from .takes.layout import MARKER_WORDS, SESSION_MARK, SOURCE_MARK
+from .takes.layout import SOURCE_MARK, session_mark, user_mark
 
 if TYPE_CHECKING:
     from .background import BackgroundSpeaker
@@ -129,7 +129,7 @@ class LiveRun:
                     if status.frames == 0:
                         keeper.first_frame(item)
                     if keeper.recorder is not recorder:
-                        recorder = self._take(keeper.recorder)
+                        recorder = self._take(keeper.recorder, item.arrival_ns)
                 if tracker.changes != changes:
                     changes = tracker.changes
                     self._pass_on(recorder, item.arrival_ns)
@@ -157,7 +157,7 @@ class LiveRun:
                 self.said(keeper.refusal)
                 keeper.refusal = ""
 
-    def _take(self, recorder: TakeRecorder | None) -> TakeRecorder | None:
+    def _take(self, recorder: TakeRecorder | None, next_arrival_ns: int) -> TakeRecorder | None:
         """A take begins or has ended. It begins with a tracker that knows nothing, as its replay will."""
         status = self.status
         status.take_failure, status.take_frames = "", 0
@@ -166,6 +166,9 @@ class LiveRun:
             self.said("the take has ended")
         else:
             self.tracker.restart()
+            now = session_toml(self.tracker.setup.session)
+            if now != recorder.info.session_toml:  # it changed while the file was being made
+                recorder.mark(session_mark(now, 0), next_arrival_ns)
             self.said(f"recording {recorder.path}")
         return recorder
 
@@ -174,7 +177,7 @@ class LiveRun:
         model, setup = self.tracker.model, self.tracker.setup
         weights = setup.session.speaker_weights
         if recorder is not None:
-            recorder.mark(f"{SESSION_MARK}: {session_toml(setup.session)}", next_arrival_ns - 1)
+            recorder.mark(session_mark(session_toml(setup.session), recorder.frames), next_arrival_ns)
         self.info = stream_info(model, setup, self.info.rate_hz)
         for sink in self.sinks:
             sink.change(self.info)
@@ -234,7 +237,7 @@ class LiveRun:
             return False
         if control.kind == "mark":
             if recorder is not None:
-                recorder.mark(control.text, control.time_ns)
+                recorder.mark(user_mark(control.text), control.time_ns)
             self.said(
                 f"mark: {control.text}" + ("" if recorder is not None else " (no take is being recorded)")
             )

@@ -89,9 +89,13 @@ class TakeKeeper:
 
     def close(self) -> None:
         """Ends everything and waits for it."""
+        self.wait()
+        self.stop_now()
+
+    def wait(self) -> None:
+        """Returns when everything that was asked for so far has been done."""
         for thread in self._threads:
             thread.join()
-        self.stop_now()
 
     def _in_background(self, work: Callable[[], None]) -> None:
         def guarded() -> None:

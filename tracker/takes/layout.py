@@ -13,6 +13,7 @@ this host, `time.perf_counter`, in s; the three number streams have one sample a
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,9 +26,31 @@ STREAM_IDS = {RAW: 1, PREPARED: 2, POSE: 3, MARKERS: 4}
 STREAM_TYPES = {RAW: "MoCap", PREPARED: "MoCap", POSE: "TonguePose", MARKERS: "Markers"}
 
 # Markers that the program writes begin with one of these words and a colon; all others are the user's.
-SESSION_MARK = "session"  # then the session as TOML: it holds from the next frame on
+SESSION_MARK = "session"  # then the session as TOML, see `session_mark`
 SOURCE_MARK = "source"  # then what the source said
 MARKER_WORDS = (SESSION_MARK, SOURCE_MARK)
+_FROM_FRAME = re.compile(r"# from frame (\d{1,15}) on\n")
+
+
+def session_mark(session_toml: str, frame: int) -> str:
+    """The mark of a set-up that holds from the take's frame `frame` on, counted from 0.
+
+    The frame is named because its time does not tell: frames that arrived in one piece have the same.
+    """
+    return f"{SESSION_MARK}: # from frame {frame} on\n{session_toml}"
+
+
+def session_frame(content: str, default: int) -> int:
+    """The frame that such a mark's content names, `default` where it names none."""
+    found = _FROM_FRAME.match(content)
+    return int(found[1]) if found else default
+
+
+def user_mark(text: str) -> str:
+    """A user's text as a mark that is not taken for one of the program's."""
+    word, colon, _ = text.partition(":")
+    return f"mark: {text}" if colon and word in MARKER_WORDS else text
+
 
 POSE_HEAD = ("status", "speaker_fixed", "valid_coils", "energy", "residual_mm", "solved_after_s")
 

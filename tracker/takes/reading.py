@@ -20,7 +20,17 @@ from ..pose import FloatArray, PoseStatus, TrackedPoses
 from ..setup import MODEL_FRAME
 from .headers import info_from_streams
 from .journal import Rows, journal_path, read_journal, read_journal_marks
-from .layout import MARKER_WORDS, MARKERS, POSE, POSE_HEAD, PREPARED, RAW, SESSION_MARK, TakeInfo
+from .layout import (
+    MARKER_WORDS,
+    MARKERS,
+    POSE,
+    POSE_HEAD,
+    PREPARED,
+    RAW,
+    SESSION_MARK,
+    TakeInfo,
+    session_frame,
+)
 from .marklog import Mark
 
 NUMBERS = (RAW, PREPARED, POSE)
@@ -180,7 +190,8 @@ class Take:
     @property
     def sessions(self) -> tuple[tuple[int, str], ...]:
         """(row from which it holds, session as TOML), the take's own first."""
-        changes = [(mark.row, mark.content) for mark in self.markers if mark.word == SESSION_MARK]
+        marks = [mark for mark in self.markers if mark.word == SESSION_MARK]
+        changes = [(session_frame(mark.content, mark.row), mark.content) for mark in marks]
         return ((0, self.info.session_toml), *changes)
 
     def frames(self) -> Iterator[CoilFrame]:

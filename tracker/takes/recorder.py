@@ -80,7 +80,7 @@ class TakeRecorder:
         recorder.put(frame, coils, pose)   # for every frame
         recorder.close()
 
-    failure: one sentence as soon as nothing more can be recorded; None = all is well.
+    info: what its header says. failure: one sentence as soon as nothing more can be recorded; None = all is well.
     write, sync: how bytes reach the file and the disk, see `appending.AppendedFile`.
     """
 
@@ -94,7 +94,7 @@ class TakeRecorder:
         self.path = Path(path)
         self.failure: str | None = None
         self.bytes_written = 0
-        self._info = info
+        self.info = info
         self._write = write
         self._sync = sync
         self._row = Row(info)
@@ -149,7 +149,7 @@ class TakeRecorder:
 
     def open(self) -> None:
         """Creates the take and its journal. Raises InputError where one exists already or cannot be made."""
-        header = file_header({"datetime": self._info.started}) + header_bytes(self._info)
+        header = file_header({"datetime": self.info.started}) + header_bytes(self.info)
         try:
             self._file = AppendedFile(self.path, self._write, self._sync)
         except FileNotFoundError as reason:
@@ -162,7 +162,7 @@ class TakeRecorder:
         try:
             self._append(header)
             self._file.flush()
-            self._journal = Journal.create(journal, self._info.row_dtype(), journal_rows(self._info), header)
+            self._journal = Journal.create(journal, self.info.row_dtype(), journal_rows(self.info), header)
             flush_folder(self.path.parent)
         except OSError as reason:
             self._file.close()
@@ -304,7 +304,7 @@ class TakeRecorder:
             if slot[-2] != first + len(taken):
                 break
             taken.append(slot)
-        return np.stack(taken).view(slot_dtype(self._info.row_dtype()))[:, 0]["row"]
+        return np.stack(taken).view(slot_dtype(self.info.row_dtype()))[:, 0]["row"]
 
     def _write_rows(self, rows: Rows) -> None:
         stamps_s = rows["arrival_ns"] * _NS
