@@ -251,6 +251,8 @@ def check(parser: Parser, example: Example, folder: Path) -> bool:
             except parser.documented:
                 pass
         kept, peak = tracemalloc.get_traced_memory()
+    except Hang as reason:
+        raise AssertionError(f"{parser.name}: {reason}") from None
     finally:
         tracemalloc.stop()
     allowed = PEAK_BYTES + PEAK_A_BYTE * len(example.data)

@@ -8,6 +8,7 @@ this file is the table; `fuzzing` says how bytes are damaged and what bounds an 
 
 import hashlib
 import os
+import signal
 import struct
 import warnings
 import zlib
@@ -20,7 +21,7 @@ from hypothesis import HealthCheck, Verbosity, given, settings
 
 from tonguetrack import InputError
 from tonguetrack.drivers import CoilFrame, Recording, SourceNote
-from tonguetrack.drivers.devices import authors_live, carstens_live, ndi, rtc3d
+from tonguetrack.drivers.devices import authors_live, carstens_live, lsl_source, ndi, rtc3d
 from tonguetrack.drivers.devices.carstens_source import CarstensConversation, shake_hands
 from tonguetrack.drivers.devices.link import LinkLost
 from tonguetrack.drivers.devices.ndi import Markers, State, ToolState, TrackingReply
@@ -51,6 +52,7 @@ from tonguetrack.tracker.takes.marklog import Mark, MarkLog, read_log
 from tonguetrack.tracker.takes.reading import read_take
 from tonguetrack.tracker.takes.recovering import recover
 
+from . import fuzzing
 from . import test_drivers_formats as formats
 from . import test_takes_reading as takes
 from . import test_xdf as xdf_files
@@ -401,6 +403,46 @@ def ndi_driver(example, folder):
             assert item is None or isinstance(item, SourceNote)
 
 
+class AnsweringLink(ScriptedLink):
+    """Says one thing each time it is asked; where more would be waited for, the connection is lost."""
+
+    def __init__(self, pieces):
+        super().__init__(pieces)
+        self.answer = b""
+
+    def send(self, data):
+        self.answer = self.pieces.pop(0) if self.pieces else b""
+
+    def receive(self, timeout_s):
+        answer, self.answer = self.answer, b""
+        if answer or timeout_s == 0.0:
+            return answer
+        raise LinkLost("closed")
+
+
+def ndi_handshake_answers():
+    """What the simulator answers from INIT to the last PENA."""
+    device, heard = NdiDevice(motion(), now=lambda: 0.0), []
+
+    class Line(AnsweringLink):
+        def send(self, data):
+            heard.append(b"".join(answer.data for answer in device.feed(data)))
+            self.answer = heard[-1]
+
+    client = Device(Line([]))
+    client.start()
+    assert len(client.enable_tools()) == 3
+    return b"".join(heard)
+
+
+def ndi_handshake(example, folder):
+    client = Device(AnsweringLink(line + b"\r" for line in example.data.split(b"\r")))
+    client.start()
+    coils = client.enable_tools()
+    assert len({coil.name for coil in coils}) == len(coils) <= 255
+    return 0
+
+
 def ndi_simulator(example, folder):
     clock = SimpleNamespace(now_s=0.0)
     device = NdiDevice(
@@ -580,6 +622,24 @@ def osc_datagram(example, folder):
     assert len(monitor.unknown) <= MAX_UNKNOWN and len(monitor.streams) <= MAX_SENDERS
     str(monitor).encode("ascii", "replace")
     monitor.as_dict()
+    return 0
+
+
+LSL_CHANNELS = [
+    b"|tip|head|PositionX|m\n|tip|head|PositionY|m\n|tip|head|PositionZ|m\n|tip|head|OrientationA|\n",
+    b"a_x||||mm\na_y||||mm\na_z||||mm\nb_x||||\nb_y||||\nb_z||||\nsound||||V\n",
+]
+
+
+def lsl_channels(example, folder):
+    """The library has read the XML: what is left are five texts a channel."""
+    lines = example.data.decode("utf-8", "replace").split("\n")
+    channels = [lsl_source.Channel(*line.split("|")[:5]) for line in lines]
+    found = lsl_source.map_channels(channels, ("", "mm")[example.choice], "name")
+    with np.errstate(over="ignore"):
+        frame = found.frame([1e308] * len(channels), 1.0, 1, 1)
+    assert frame.positions.shape == (len(found.coils), 3)
+    assert len(set(found.coils)) == len(found.coils)
     return 0
 
 
@@ -833,7 +893,6 @@ SOURCE_WORDS = tuple(
     for row in SOURCES
     for word in (row.scheme + ":", row.scheme.upper(), row.forms.partition(" ")[0], *row.options)
 ) + tuple(b"// : ? & = [ ] @ / # % %00 %ff ; [::1] \n \xff".split(b" "))
-NO_FAULT = ()
 NDI_TOO = (ndi.NdiDamaged, ndi.NdiError)
 
 PARSERS = (
@@ -904,6 +963,14 @@ PARSERS = (
         ndi_driver, (LinkLost,), quick=70, words=(*BX_ADDED, ndi.error_reply(1)), choices=(0, 1), seal=sealed_stream,
     ),
     Parser(
+        "NDI: handshake",
+        seeds(ndi_handshake_answers()),
+        ndi_handshake,
+        NDI_TOO[1:] + (LinkLost,),
+        seal=sealed_lines,
+        words=(ndi.reply("OKAY"), ndi.error_reply(1), ndi.reply(PHSR), ndi.reply("00"), ndi.reply("UNOCCUPIED")),
+    ),
+    Parser(
         "NDI: simulator",
         seeds(b"".join(ndi.command(*text.split(":")) for text in NDI_COMMANDS))
         + (Seed(b"".join(text.replace(":", " ").encode() + b"\r" for text in NDI_COMMANDS), 2),),
@@ -942,6 +1009,15 @@ PARSERS = (
     ),
     Parser("OSC datagrams", seeds(*CONTROLS, *our_datagrams()), osc_datagram, quick=90,
         words=(b"#bundle\0", b"/tongue/frame\0\0\0", b",s\0\0", b",[[[", b",b\0\0", b"\xff\xff\xff\xfc", b"/marker\0"),
+    ),
+    Parser(
+        "LSL: channels",
+        (Seed(LSL_CHANNELS[0]), Seed(LSL_CHANNELS[0], 1), Seed(LSL_CHANNELS[1], 1)),
+        lsl_channels,
+        (InputError,),
+        quick=40,
+        choices=(0, 1),
+        words=(b"|", b"\n", b"_x", b"_", b"positionx", b"PositionZ", b"orientationd", b"metres", b"mm"),
     ),
     Parser(
         "addresses of sources",
@@ -1014,6 +1090,38 @@ def test_damaged_bytes_raise_nothing_but_what_is_documented(parser, tmp_path):
     print(f"{parser.name}: {accepted} of {runs} examples were accepted")
     # A parser that refuses whatever it gets would be no parser; a scripted link is always lost in the end.
     assert accepted or LinkLost in parser.documented or not NIGHTLY
+
+
+def test_the_bounds_are_felt(tmp_path, monkeypatch):
+    monkeypatch.setattr(fuzzing, "HARD_LIMIT_S", 0.05)
+    monkeypatch.setattr(fuzzing, "KEPT_BYTES", 10_000)
+    kept = []
+
+    def hang(example, folder):
+        while hasattr(signal, "setitimer"):
+            pass
+        raise AssertionError("still at work, as it seems where there are no such signals")
+
+    def grow(example, folder):
+        kept.append(bytes(20_000))
+        return 0
+
+    def swell(example, folder):
+        return len(bytes(fuzzing.PEAK_BYTES + 1000)) * 0
+
+    def hold(example, folder):
+        return 5
+
+    for run, words in {hang: "still at work", grow: "keeps", swell: "took", hold: "holds 5"}.items():
+        with pytest.raises(AssertionError, match=words):
+            check(Parser("p", seeds(b"x"), run, holds=4), Example(b"x", 0), tmp_path)
+
+    def refuse(example, folder):
+        raise KeyError(1)
+
+    assert not check(Parser("p", seeds(b"x"), refuse, (KeyError,)), Example(b"x", 0), tmp_path)
+    with pytest.raises(KeyError):
+        check(Parser("p", seeds(b"x"), refuse), Example(b"x", 0), tmp_path)
 
 
 # What was found -------------------------------------------------------------------------------------
