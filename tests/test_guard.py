@@ -7,6 +7,7 @@ import pytest
 
 from tonguetrack.drivers import ReplaySource, open_recording
 from tonguetrack.tracker.bench import made_up_recording
+from tonguetrack.tracker.guard import CoilGuard
 from tonguetrack.tracker.online import Tracker
 from tonguetrack.tracker.pose import CoilState, PoseStatus
 from tonguetrack.tracker.tracking import track_recording
@@ -132,6 +133,56 @@ def test_a_coil_that_freezes_while_others_move_is_stuck(small_model, take):
     assert (states[1000 + SECOND // 4 :, BAD] == CoilState.TRUSTED).all()
 
 
+def test_a_coil_that_comes_back_with_the_bits_it_went_with_is_not_stuck(small_model, take):
+    recording, setup = take
+
+    def blink(coil):
+        coil[600:900] = np.nan
+        coil[900:905] = coil[599]
+
+    states, *_ = watched(small_model, spoilt(recording, blink), setup)
+    assert (states[900:, BAD] == CoilState.TRUSTED).all()
+
+
+def test_a_misfit_whose_judges_are_gone_is_believed_again(small_model, take):
+    recording, setup = take
+    positions = recording.positions.copy()
+    positions[:, 3:] = np.nan
+    positions[500:700, BAD] += [0.0, 12.0, 25.0]
+    positions[650:, [0, 2]] = np.nan
+    states, _, statuses, _ = watched(small_model, replace(recording, positions=positions), setup)
+    assert (states[530:650, BAD] == CoilState.MISFIT).all()
+    assert (states[650 + SECOND :, BAD] == CoilState.TRUSTED).all()
+    assert (statuses[650 + SECOND :] == PoseStatus.OK).all()
+
+
+def test_where_all_coils_have_moved_none_is_left_out_for_good(small_model, take):
+    recording, setup = take
+    positions = recording.positions.copy()
+    positions[500:] += 100.0
+    states, *_ = watched(small_model, replace(recording, positions=positions), setup)
+    assert (states[500:520] == CoilState.WILD).all()
+    assert (states[500 + 2 * SECOND :] == CoilState.TRUSTED).all()
+
+
+@pytest.mark.parametrize("noise_mm", [0.1, 1.0])
+@pytest.mark.parametrize("rate_hz", [40.0, 100.0, 250.0, 400.0, 1250.0])
+def test_noise_and_fast_movements_are_not_wild(rate_hz, noise_mm):
+    """Five coils that swing at up to 1 m/s."""
+    random = np.random.default_rng(2)
+    times_s = np.arange(int(8 * rate_hz)) / rate_hz
+    directions = random.normal(size=(5, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    swing = 1000.0 / (8 * np.pi) * np.sin(8 * np.pi * times_s[:, None] + np.arange(5))
+    positions = swing[:, :, None] * directions + random.normal(scale=noise_mm, size=(len(times_s), 5, 3))
+    guard = CoilGuard(5)
+    distrusted = 0
+    for time_s, coils in zip(times_s.tolist(), positions, strict=True):
+        guard.admit(coils, time_s)
+        distrusted += int((guard.states != CoilState.TRUSTED).sum())
+    assert distrusted < 0.001 * positions.shape[0] * 5
+
+
 def test_a_device_that_repeats_whole_frames_has_no_stuck_coils(small_model, take):
     recording, setup = take
     positions = recording.positions.copy()
@@ -194,7 +245,6 @@ def test_a_jump_of_the_clock_starts_the_pose_anew(small_model, take):
 def test_ordinary_coils_of_real_recordings_keep_their_say(reference_data, small_model, name):
     """Judged by their movement alone: no model fits these recordings unaligned."""
     from tonguetrack.drivers import find_recordings
-    from tonguetrack.tracker.guard import CoilGuard
 
     place = reference_data / "recordings" / name
     if place.is_dir():

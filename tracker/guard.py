@@ -9,6 +9,8 @@ Judged by the source's own clock alone, so that a replay decides the same. What 
 - bits: a position that repeats itself exactly for `STUCK_S`, while other coils move, is stuck.
 
 At least two coils are left to the solver by the misfit rule; a coil cannot be judged by a pose that it makes alone.
+Where misfits outnumber the others for `OUTVOTED_S`, because those failed or all have moved, nobody can tell who is
+right: they are forgiven, and all usual distances learnt anew.
 """
 
 from __future__ import annotations
@@ -24,8 +26,8 @@ FASTEST_MM_S = 2000.0
 """Tongue tips reach some hundred mm/s in speech."""
 SLACK_MM = 3.0
 """What noise and quantisation may add to any step."""
-LONGEST_STEP_S = 0.025
-"""Beyond this time the room for a step grows no further: a tongue turns round."""
+SHORTEST_STEP_S, LONGEST_STEP_S = 0.0025, 0.025
+"""Below, the room for a step shrinks no further: noise does not either. Beyond, it grows no further: a tongue turns round."""
 STRIKE_DECAY_S = 0.2
 MAX_STRIKES = 2.0
 RETURN_S = 0.1
@@ -35,6 +37,7 @@ LEARN_S = 0.5
 MISFIT_FACTOR, MISFIT_MM = 3.0, 3.0
 FIT_FACTOR, FIT_MM = 2.0, 2.0
 STUCK_S = 0.25
+OUTVOTED_S = 0.5
 
 _TRUSTED, _MISSING, _WILD, _MISFIT, _STUCK, _RETURNING = (int(state) for state in CoilState)
 
@@ -48,7 +51,8 @@ _SMOOTH_MM, _TYPICAL_MM, _LEARNT_S = 10, 11, 12  # distance from the model: now,
 _MISFITS = 13  # 1.0 while it is one
 _FIT_SINCE_S = 14  # since when a misfit fits again; NaN = it does not
 _MOVED_S = 15  # when its position last differed from the one before
-_ROWS = 16
+_OUTVOTED_S = 16  # since when misfits outnumber the others; NaN = they do not; in the first column alone
+_ROWS = 17
 
 
 class CoilGuard:
@@ -76,6 +80,7 @@ class CoilGuard:
         self._memory[_STRIKES] = 0.0
         self._memory[_MOVED_S] = np.nan
         self._memory[_FIT_SINCE_S] = np.nan
+        self._memory[_OUTVOTED_S] = np.nan
 
     def admit(self, coils: FloatArray, time_s: float) -> FloatArray:
         """Judges coils (n, 3), mm, NaN = missing, of the moment `time_s`; returns `used`. Nothing is allocated."""
@@ -101,7 +106,7 @@ def _step_is_possible(
     for axis in range(3):
         way = coils[i, axis] - memory[first + axis, i]
         squared += way * way
-    room = SLACK_MM + FASTEST_MM_S * min(max(time_s - then_s, 0.0), LONGEST_STEP_S)
+    room = SLACK_MM + FASTEST_MM_S * min(max(time_s - then_s, SHORTEST_STEP_S), LONGEST_STEP_S)
     return bool(squared <= room * room)
 
 
@@ -112,9 +117,11 @@ def _admit(
     """Whether all coils that are there count."""
     n = coils.shape[0]
     all_counted = True
+    trusted = misfits = 0
     for i in range(n):
         if np.isnan(coils[i, 0]):
             states[i] = _MISSING
+            memory[_MOVED_S, i] = np.nan  # where it comes back, it has not been standing there
             for axis in range(3):
                 used[i, axis] = np.nan
             continue
@@ -140,6 +147,7 @@ def _admit(
             states[i] = _RETURNING
         if memory[_MISFITS, i] > 0.0 and states[i] == _TRUSTED:
             states[i] = _MISFIT if np.isnan(memory[_FIT_SINCE_S, i]) else _RETURNING
+            misfits += 1
         for axis in range(3):
             memory[_LAST_X + axis, i] = coils[i, axis]
         memory[_LAST_S, i] = time_s
@@ -162,8 +170,16 @@ def _admit(
                 memory[_KEPT_X + axis, i] = coils[i, axis]
         if counts:
             memory[_KEPT_S, i] = time_s
+            trusted += 1
         else:
             all_counted = False
+    if misfits <= trusted:
+        memory[_OUTVOTED_S, 0] = np.nan
+    elif np.isnan(memory[_OUTVOTED_S, 0]):
+        memory[_OUTVOTED_S, 0] = time_s
+    elif time_s - memory[_OUTVOTED_S, 0] >= OUTVOTED_S:  # from the next frame on
+        memory[_MISFITS, :] = 0.0
+        memory[_LEARNT_S, :] = 0.0
     return all_counted
 
 
