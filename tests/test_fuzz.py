@@ -1191,3 +1191,27 @@ def test_the_longest_reply_may_still_lack_its_end_when_a_whole_read_follows():
     assert reader.next() is None
     reader.feed(bytes(1 << 16))
     assert reader.next() == ndi.Reply(sealed_header(b"\xc4\xa5\xff\xff\0\0") + bytes(0xFFFF + 2))
+
+
+@pytest.mark.parametrize("text", [b"x", b"OKAY", b"OKAYA896"])
+@pytest.mark.parametrize("size", [1, 1 << 16])
+def test_a_line_without_end_or_full_of_beginnings_is_work_in_proportion_to_its_length(
+    text, size, monkeypatch
+):
+    looked = []
+    good_line, not_text = ndi._good_line, ndi._NOT_TEXT
+
+    def search(buffer, begin=0):
+        looked.append(len(buffer) - begin)
+        return not_text.search(buffer, begin)
+
+    monkeypatch.setattr(ndi, "_good_line", lambda line: looked.append(len(line)) or good_line(line))
+    monkeypatch.setattr(ndi, "_NOT_TEXT", SimpleNamespace(search=search))
+    data = text * (30_000 // len(text)) + b"\r" + ndi.reply("OKAY")
+    reader, found = ndi.ReplyReader(), []
+    for begin in range(0, len(data), size):
+        reader.feed(data[begin : begin + size])
+        while (item := reader.next()) is not None:
+            found.append(item)
+    assert found[-1] == ndi.Reply(ndi.reply("OKAY"))
+    assert sum(looked) <= 20 * len(data)

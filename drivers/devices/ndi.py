@@ -668,7 +668,8 @@ class ReplyReader:
         self._bad = 0
         self._bad_record = 0  # where the bad bytes began with a good header: the size that it gave
         self._ready: list[Reply] = []
-        self._allowance = 0  # bytes of failed bodies that may still be looked through again
+        self._allowance = 0  # bytes that may still be looked through again
+        self._searched = 0  # so many at the front are text without an end
 
     @property
     def pending(self) -> bool:
@@ -708,7 +709,9 @@ class ReplyReader:
                 # One record of the right length and a wrong CRC is all that has come: nothing else begins in it.
                 self._bad += len(self._buffer)
                 self._buffer.clear()
+                self._searched = 0
                 return self._damage()
+            self._searched = 0
             if self._ready:
                 del self._buffer[:size]
                 continue
@@ -752,13 +755,13 @@ class ReplyReader:
         # Where a byte was lost, the next reply begins inside what the header claims.
         if not self._bad:
             self._bad_record = size
-        self._allowance -= size
-        return 1 if self._allowance >= 0 else size
+        return 1 if self._may_look_again(size) else size
 
     def _text(self) -> int:
         buffer = self._buffer
-        end = _NOT_TEXT.search(buffer)
+        end = _NOT_TEXT.search(buffer, self._searched)
         if end is None:
+            self._searched = len(buffer)
             return len(buffer) if len(buffer) > MAX_TEXT else 0
         stop = end.start()
         if buffer[stop] != 0x0D:
@@ -774,13 +777,23 @@ class ReplyReader:
         crc = 0
         for index in range(4, len(line) - 9):
             crc = crc16(line[index - 4 : index - 3], crc)
-            if line[index - 3 : index + 1] == b"%04X" % crc and _good_line(line[index + 1 :]):
+            if line[index - 3 : index + 1] == b"%04X" % crc and self._good_rest(line, index + 1):
                 self._ready += [Reply(line[: index + 1] + CR), Reply(line[index + 1 :])]
                 return len(line)
         for start in _KNOWN_STARTS.finditer(line, 1):
-            if _good_line(line[start.start() :]):
+            if self._good_rest(line, start.start()):
                 return start.start()
         return len(line)
+
+    def _good_rest(self, line: bytes, begin: int) -> bool:
+        return self._may_look_again(len(line) - begin) and _good_line(line[begin:])
+
+    def _may_look_again(self, size: int) -> bool:
+        """Whether the work stays in proportion to what was fed; if so, the bytes are counted."""
+        if size > self._allowance:
+            return False
+        self._allowance -= size
+        return True
 
 
 def _good_line(line: bytes) -> bool:
