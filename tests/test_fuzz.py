@@ -12,6 +12,7 @@ import os
 import signal
 import struct
 import sys
+import tracemalloc
 import warnings
 import zlib
 from dataclasses import replace
@@ -1215,3 +1216,20 @@ def test_a_line_without_end_or_full_of_beginnings_is_work_in_proportion_to_its_l
             found.append(item)
     assert found[-1] == ndi.Reply(ndi.reply("OKAY"))
     assert sum(looked) <= 20 * len(data)
+
+
+def test_a_short_journal_with_a_long_header_takes_no_more_memory_than_it_has(tmp_path):
+    header = journal.JournalHeader((60_000, 1, 1), 2000, 60 << 20, bytes(32))
+    (tmp_path / "a.journal").write_bytes(header.packed())
+    (tmp_path / "a").write_bytes(TAKE_HEAD)
+    for take in (None, tmp_path / "a"):
+        tracemalloc.start()
+        try:
+            if take is None:
+                assert len(read_journal(tmp_path / "a.journal")) == 0
+            else:
+                with pytest.raises(InputError, match="another take"):
+                    read_journal(tmp_path / "a.journal", take)
+            assert tracemalloc.get_traced_memory()[1] < 1 << 20
+        finally:
+            tracemalloc.stop()

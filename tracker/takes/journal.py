@@ -194,10 +194,13 @@ def _read(path: str | os.PathLike[str], take: str | os.PathLike[str] | None) -> 
             size = os.fstat(file.fileno()).st_size
             header = _header(file.read(HEADER.size + CHECKSUM.size), size, name)
             file.seek(MARKS_AT)
-            data = file.read(header.file_bytes - MARKS_AT)
+            data = file.read(
+                max(0, size - MARKS_AT)
+            )  # not more: room for all that is asked for is taken at once
         if take is not None:
             with open(take, "rb") as file:
-                if hashlib.sha256(file.read(header.take_bytes)).digest() != header.digest:
+                begins = file.read(min(header.take_bytes, os.fstat(file.fileno()).st_size))
+                if hashlib.sha256(begins).digest() != header.digest:
                     raise InputError(f"{name}: this journal belongs to another take; move it away.")
     except OSError as reason:
         raise InputError(
