@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from .. import InputError
-from ..drivers.frames import CoilFrame, Recording, SourceNote
+from ..drivers.frames import CoilFrame, NoteKind, Recording
 from ..drivers.replay import ReplaySource
 from ..drivers.sources import Source
 from .session import Session
@@ -16,12 +16,13 @@ from .session import Session
 MAX_FRAMES = 20_000
 RATE_S = 0.1
 UNKNOWN_RATE_HZ = 100.0
+SHORTEST_STEP_S, LONGEST_STEP_S = 1e-6, 1.0
 PATIENCE_S = 15.0
 """Without a single frame for this long nothing is going to come."""
 
 
 def recording_for_setup(
-    source: Source, session: Session, seconds: float, told: Callable[[SourceNote], None] = lambda note: None
+    source: Source, session: Session, seconds: float, told: Callable[[str], None] = lambda text: None
 ) -> Recording:
     """What `complete_setup` needs to know of a source: as little as the session leaves open.
 
@@ -38,38 +39,45 @@ def recording_for_setup(
     return gather(source, RATE_S if stated else seconds, told)
 
 
-def gather(
-    source: Source, seconds: float, told: Callable[[SourceNote], None] = lambda note: None
-) -> Recording:
-    """Reads frames for `seconds` of the source's time, at least one. Notes on the way go to `told`.
+def gather(source: Source, seconds: float, told: Callable[[str], None] = lambda text: None) -> Recording:
+    """Reads frames for `seconds` of the source's time, at least one, or four times as long and a second more of this host's.
 
+    What the source says on the way goes to `told`, apart from its silence. Where the device's clock stands still
+    or jumps, the frames' arrival tells the time.
     Raises InputError where no frame comes within PATIENCE_S, or the source ends before the first one.
     """
     positions: list[np.ndarray] = []
     times: list[float] = []
+    last: CoilFrame | None = None
     since = time.perf_counter()
     for item in source:
-        if not isinstance(item, CoilFrame):
-            told(item)
-            if not positions and time.perf_counter() - since > PATIENCE_S:
-                raise InputError(
-                    f"{source.address}: connected, but no frame came within {PATIENCE_S:.0f} s; is it measuring?"
-                )
-            continue
-        if times and item.device_time_s <= times[-1]:
-            positions.clear()  # the device's clock began anew, or it has none: only order is left
-            times.clear()
-        positions.append(np.array(item.positions))
-        times.append(item.device_time_s)
-        if times[-1] - times[0] >= seconds or time.perf_counter() - since > 4 * seconds + 1:
+        waited_s = time.perf_counter() - since
+        if isinstance(item, CoilFrame):
+            times.append(times[-1] + _step_s(last, item) if last is not None else 0.0)
+            positions.append(np.array(item.positions))
+            last = item
+            if times[-1] >= seconds or len(times) >= MAX_FRAMES:
+                break
+        elif item.kind is not NoteKind.SILENT:
+            told(item.text)
+        if times and waited_s > 4 * seconds + 1:
             break
-        if len(times) >= MAX_FRAMES:
-            break
+        if not times and waited_s > PATIENCE_S:
+            raise InputError(
+                f"{source.address}: connected, but no frame came within {PATIENCE_S:.0f} s; is it measuring?"
+            )
     if not times:
         raise InputError(f"{source.address}: the source ended before its first frame.")
-    span_s = times[-1] - times[0]
-    rate_hz = source.rate_hz or ((len(times) - 1) / span_s if span_s > 0 else 0.0)
-    return _recording(source, np.stack(positions), np.asarray(times) - times[0], rate_hz or UNKNOWN_RATE_HZ)
+    rate_hz = source.rate_hz or ((len(times) - 1) / times[-1] if times[-1] > 0 else UNKNOWN_RATE_HZ)
+    return _recording(source, np.stack(positions), np.asarray(times), rate_hz)
+
+
+def _step_s(last: CoilFrame, frame: CoilFrame) -> float:
+    """Time from one frame to the next, above 0."""
+    step_s = frame.device_time_s - last.device_time_s
+    if 0.0 < step_s <= LONGEST_STEP_S:
+        return step_s
+    return max((frame.arrival_ns - last.arrival_ns) * 1e-9, SHORTEST_STEP_S)
 
 
 def _recording(source: Source, positions: np.ndarray, times_s: np.ndarray, rate_hz: float) -> Recording:

@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
+from ..drivers.devices.clock import LONGEST_GAP_S
 from ..drivers.frames import CoilFrame, NoteKind, Recording, SourceNote
 from ..drivers.replay import ReplaySource
 from ..model.multilinear import TongueModel
@@ -24,6 +25,7 @@ from .streams.sink import Sink, StreamInfo
 from .takes.layout import SOURCE_MARK, session_mark, user_mark
 
 if TYPE_CHECKING:
+    from .anatomy import SpeakerEstimate
     from .background import BackgroundSpeaker
     from .takes.keeper import TakeKeeper
     from .takes.recorder import TakeRecorder
@@ -97,7 +99,8 @@ class LiveRun:
     seconds: float | None = None
     said: Callable[[str], None] = lambda text: None
     handles: Callable[[SourceNote, Tracker], Setup | None] | None = None
-    _followed: object = None  # the estimate that the tracker goes by already
+    _followed: SpeakerEstimate | None = None  # the estimate that the tracker goes by already
+    _listening: bool = True  # whether the background's next estimate will be followed
     _listened_s: float = 0.0  # tracked speech that the background was given
 
     def run(self) -> Summary:
@@ -119,11 +122,13 @@ class LiveRun:
         step, add, sinks, controls = tracker.step, status.add, tuple(self.sinks), self.controls
         recorder: TakeRecorder | None = None
         changes = tracker.changes
-        end = _End(self.seconds, self.source)
+        end = _End(self.seconds, 1.0 / self.source.rate_hz if self.source.rate_hz else tracker.period_s)
         for item in self.source:
             if not isinstance(item, CoilFrame):
                 if not self._note(item, recorder):
                     break
+                if item.kind is NoteKind.CLOCK_RESET:
+                    end.begin_anew()
             else:
                 if keeper is not None:
                     if status.frames == 0:
@@ -145,10 +150,10 @@ class LiveRun:
                         status.take_failure = recorder.failure
                         self.said(f"NOT RECORDING: {recorder.failure}")
                 add(pose, before_ns, sent_ns)
-                if end.reached(item):
+                if end.reached(item.device_time_s):
                     break
                 tracker.settle()
-                if self.background is not None:
+                if self.background is not None and self._listening:
                     self._follow(self.background)
             while (control := controls.take()) is not None:
                 if not self._obey(control, recorder):
@@ -224,11 +229,12 @@ class LiveRun:
         if estimate is None or estimate is self._followed:
             return
         self._followed = estimate
-        final = self._listened_s >= self.fix_after_s
+        self._go_by(estimate, self._listened_s >= self.fix_after_s)
+
+    def _go_by(self, estimate: SpeakerEstimate, final: bool) -> None:
         source = f"joint estimate from {estimate.frames} frames of this run"
-        tracker.fix_speaker(estimate.weights, source if final else f"{source}, not final")
-        if final:
-            self.background = None
+        self.tracker.fix_speaker(estimate.weights, source if final else f"{source}, not final")
+        self._listening = not final
 
     def _obey(self, control: Control, recorder: TakeRecorder | None) -> bool:
         """What a user asked for; False ends the run."""
@@ -249,29 +255,43 @@ class LiveRun:
             else:
                 keeper.stop()
         elif control.kind == "fix_speaker":
-            if self.tracker.setup.session.speaker_weights is None and not self.tracker.fix_average():
-                self.said("the speaker cannot be fixed yet: no frame was tracked")
+            self._fix_speaker()
         elif control.kind == "free_speaker":
             self.tracker.free_speaker()
+            self._listening, self._listened_s = True, 0.0
         return True
+
+    def _fix_speaker(self) -> None:
+        """The speaker stays what it is now, or becomes the mean of what it was."""
+        if self.tracker.setup.session.speaker_weights is None:
+            if not self.tracker.fix_average():
+                self.said("the speaker cannot be fixed yet: no frame was tracked")
+                return
+            self._listening = False
+        elif self._listening and self._followed is not None:
+            self._go_by(self._followed, final=True)
 
 
 class _End:
-    """Whether the source has delivered as many seconds, by its own clock, as were asked for."""
+    """Whether the source has delivered as many seconds, by its own clock, as were asked for.
 
-    def __init__(self, seconds: float | None, source: FrameSource) -> None:
-        self._seconds = seconds
-        self._source = source
-        self._last_s = float("inf")
-        self._started = seconds is None
+    A frame whose time stands still, goes back or jumps counts as one period.
+    """
 
-    def reached(self, frame: CoilFrame) -> bool:
-        if not self._started:
-            assert self._seconds is not None
-            period_s = 1.0 / self._source.rate_hz if self._source.rate_hz else 0.0
-            self._last_s = frame.device_time_s + self._seconds - period_s - 1e-6
-            self._started = True
-        return frame.device_time_s >= self._last_s
+    def __init__(self, seconds: float | None, period_s: float) -> None:
+        self._left_s = float("inf") if seconds is None else seconds
+        self._period_s = period_s
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """The next frame's time does not follow from the last one's."""
+        self._before_s = float("nan")
+
+    def reached(self, device_time_s: float) -> bool:
+        passed_s = device_time_s - self._before_s
+        self._before_s = device_time_s
+        self._left_s -= passed_s if 0.0 < passed_s <= LONGEST_GAP_S else self._period_s
+        return self._left_s < 1e-6
 
 
 def stream_recording(

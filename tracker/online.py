@@ -41,9 +41,10 @@ class Tracker:
     watchful: for live sources. Bad coils lose their say (`guard.CoilGuard`), a pose without coils drifts back
     to the mean, after a gap the tracker starts anew. Otherwise every coil is believed and every frame follows
     the last one: the poses are those of `track_recording`, bit for bit.
-    rate_hz: nominal, 0.0 = unknown: then that of most devices. fix_after_s: with a free speaker, so much tracked speech is averaged and
-    the speaker then fixed (paper, section "Experiments"); None = never by itself.
-    period_s: the nominal time between frames. changes: grows with every change of the set-up, for those who have to pass it on.
+    rate_hz: nominal, 0.0 = unknown: then that of most devices. fix_after_s: with a free speaker, so much tracked
+    speech is averaged and the speaker then fixed (paper, section "Experiments"); None = never by itself.
+    period_s: the nominal time between frames. changes: grows with every change of the set-up, for those who have
+    to pass it on.
     """
 
     def __init__(
@@ -77,17 +78,25 @@ class Tracker:
     @property
     def used(self) -> FloatArray:
         """(n, 3) those of them that counted."""
-        return self._guard.used
+        return self._guard.used if self._watchful else self._preparation.coils
 
     def warm_up(self) -> None:
-        """Compiles or loads every kernel that a frame may need, also those of a speaker that is fixed later."""
+        """Compiles or loads every kernel that a frame may need, also those of a speaker that is fixed later.
+
+        In a live run, where a user may free it, also those of a speaker that is free later.
+        """
         missing = np.full_like(self._preparation.coils, np.nan)
         self._preparation.frame(np.full((self._preparation.channels_needed, 3), np.nan))
-        self._solver.solve(missing)
-        self._solver.distances(missing, self._distances)
+        solvers = [self._solver]
+        vertices, energy = self.setup.vertices, self.setup.session.energy
         if isinstance(self._solver, FreeSpeakerSolver):
-            speaker = self.model.for_speaker(self.model.speaker.mean).at(self.setup.vertices)
-            FixedSpeakerSolver(speaker, self.setup.session.energy).solve(missing)
+            speaker = self.model.for_speaker(self.model.speaker.mean).at(vertices)
+            solvers.append(FixedSpeakerSolver(speaker, energy))
+        elif self._watchful:
+            solvers.append(FreeSpeakerSolver(self.model.at(vertices), energy))
+        for solver in solvers:
+            solver.solve(missing)
+            solver.distances(missing, self._distances)
         self._guard.admit(missing, 0.0)
         self._guard.learn(self._distances, 0.0, 0.0)
         self.restart()
@@ -105,7 +114,8 @@ class Tracker:
     def change(self, setup: Setup) -> None:
         """Goes on with another set-up: the speaker became known, or a client changed the energy.
 
-        The next pose still follows the last one. Coils and vertices stay; for others there is another tracker.
+        Where the speaker is fixed, the next pose still follows the last one; with a free one it starts at the mean.
+        Coils and vertices stay; for others there is another tracker.
         """
         pose, status = self.pose.weights.copy(), self.pose.status
         self._build(setup)

@@ -70,8 +70,10 @@ def run_live_command(args: argparse.Namespace) -> int:
     """Set up, track until the end, print the summary. Exit code 1 where a take could not be recorded whole."""
     from pathlib import Path
 
+    from ... import InputError
     from ..sources import open_source
     from ..streams.osc import resolve
+    from ..takes.keeper import check_place
     from .names import keep_apart, named_model, prepare_folder
     from .track import read_session
     from .watching import stopped_by_signals
@@ -84,12 +86,19 @@ def run_live_command(args: argparse.Namespace) -> int:
     for output in filter(None, (args.save_session, args.record)):
         keep_apart([Path(output)], [Path(args.model)])
         prepare_folder(Path(output))
+    if args.record:
+        check_place(args.record)
     say(f"model: {model.name} [{model.fingerprint}]")
     say(f"opening {args.source}")
     source = open_source(args.source)
     try:
-        with stopped_by_signals(source):
-            summary = run_source(args, source, model, session, destinations)
+        with stopped_by_signals(source) as stopped:
+            try:
+                summary = run_source(args, source, model, session, destinations)
+            except InputError:  # a source that was stopped tells too little to begin with
+                if not stopped.is_set():
+                    raise
+                summary = None
     finally:
         source.close()
     if summary is None:
@@ -113,12 +122,11 @@ def run_source(
         return serve_clients(
             args, source, model, session if session.source != NO_SESSION else None, destinations
         )
-    recording = recording_for_setup(source, session, LISTEN_S, lambda note: say(note.text))
+    recording = recording_for_setup(source, session, LISTEN_S, say)
     setup = complete_setup(recording, model, session)
     for decision in setup.decisions:
         say(decision)
-    averaged = setup.session.speaker_weights is None and args.speaker == "mean"
-    fix_after_s = args.fix_speaker_after if averaged else None
+    fix_after_s = args.fix_speaker_after if args.speaker == "mean" else None
     rate_hz = source.rate_hz or recording.rate_hz
     tracker = Tracker(model, setup, rate_hz, watchful=True, fix_after_s=fix_after_s)
     return run_once(args, source, tracker, destinations)

@@ -62,17 +62,19 @@ def watched(source: FrameSource, status: LiveStatus) -> Iterator[None]:
 
 
 @contextmanager
-def stopped_by_signals(source: FrameSource) -> Iterator[None]:
+def stopped_by_signals(source: FrameSource) -> Iterator[threading.Event]:
     """The first Ctrl-C, or a request to terminate, stops the source, so that the run ends as at its last frame;
-    a second one interrupts."""
+    a second one interrupts. The event is set once that has happened."""
+    stopped = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield stopped
         return
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def stop(number: int, frame: FrameType | None) -> None:
         restore()
+        stopped.set()
         source.stop()
 
     def restore() -> None:
@@ -82,7 +84,7 @@ def stopped_by_signals(source: FrameSource) -> Iterator[None]:
     for number in before:
         signal.signal(number, stop)
     try:
-        yield
+        yield stopped
     finally:
         restore()
 

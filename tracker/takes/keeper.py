@@ -33,8 +33,7 @@ class TakeKeeper:
     take-002.xdf, ...; names that are asked for are used as they are. No file is ever overwritten.
     describe: what a take's header says, from one of the source's frames; asked when a take begins.
 
-    `recorder` is what the loop reads at every frame: None between takes. Raises InputError where the first
-    take's file exists already.
+    `recorder` is what the loop reads at every frame: None between takes.
     """
 
     def __init__(self, place: str | Path, describe: Callable[[CoilFrame], TakeInfo]) -> None:
@@ -42,10 +41,6 @@ class TakeKeeper:
         self.finished: list[KeptTake] = []
         self.refusal = ""
         self._place = Path(place)
-        if not is_folder(self._place) and self._place.exists():
-            raise InputError(
-                f"{place}: this take exists already; choose another name, takes are never overwritten."
-            )
         self._describe = describe
         self._frame: CoilFrame | None = None
         self._busy = threading.Lock()
@@ -122,6 +117,20 @@ class TakeKeeper:
         if not self.finished and not self._place.exists():
             return self._place
         return _unused(self._place.with_suffix(""))
+
+
+def check_place(place: str | Path) -> None:
+    """Raises InputError where the first take's file exists already, or what should be a folder is a file."""
+    place = Path(place)
+    if is_folder(place):
+        if place.exists() and not place.is_dir():
+            raise InputError(
+                f"{place}: this is a file; name a folder for takes, or a new file that ends in .xdf."
+            )
+    elif place.exists():
+        raise InputError(
+            f"{place}: this take exists already; choose another name, takes are never overwritten."
+        )
 
 
 def is_folder(place: Path) -> bool:
