@@ -1176,6 +1176,7 @@ def test_a_take_described_by_numbers_beyond_measure_is_damaged(name, number, tmp
     ("text", "words"),
     [
         (f"[energy]\nbox = {'9' * 5000}", "not readable TOML"),
+        (f"[energy]\n{'a.' * 100_000}a = 1", "1000 dots"),  # took minutes
         ("[alignment]\nrotation = [[1e300, 0, 0], [0, 1e300, 0], [0, 0, 1]]", "not orthonormal"),
     ],
 )

@@ -26,6 +26,7 @@ plane and palate belong between [coils] and [alignment]; their tables are not re
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -41,6 +42,8 @@ from .pose import FloatArray
 MAX_SESSION_BYTES = 1024 * 1024
 LARGEST_TERM = 1e12  # of the energy's weights: beyond, float64 loses the other terms
 NO_SESSION = "no session file"
+_ENDLESS_KEY = re.compile(r"^(?:[^.=\n]*\.){1000}", re.MULTILINE)
+"""For a key of many parts tomllib's work grows with the square of their number."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,8 @@ def load_session(path: str | Path) -> Session:
 
 def parse_session(text: str, source: str) -> Session:
     """A session from the text of a file. Raises InputError that names `source`, the table and the key at fault."""
+    if _ENDLESS_KEY.search(text):
+        raise InputError(f"{source}: a line has 1000 dots before any '='; a session file has no such keys.")
     try:
         content = tomllib.loads(text)
     except RecursionError as reason:
