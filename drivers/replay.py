@@ -34,7 +34,9 @@ class ReplaySource:
     at the hand-over; how late that was is in `lateness_ns`.
     """
 
-    def __init__(self, recording: Recording, speed: float | None = 1.0, loop: bool = False) -> None:
+    def __init__(
+        self, recording: Recording, speed: float | None = 1.0, loop: bool = False, address: str = ""
+    ) -> None:
         if speed is not None and not 0 < speed < float("inf"):
             raise InputError(
                 f"speed {speed!r} is not possible; pass a factor above 0, or None for no pacing."
@@ -42,6 +44,7 @@ class ReplaySource:
         if recording.frame_count == 0:
             raise InputError(f"{recording.source or 'recording'}: no frames to play.")
         self.recording = recording
+        self.address = address or f"replay:{recording.source}"
         self.speed = speed
         self.loop = loop
         self.lateness_ns = np.full(recording.frame_count, -1, np.int64)
@@ -124,10 +127,6 @@ class ReplaySource:
             None if recording.rms is None else recording.rms[index],
             None if recording.status is None else recording.status[index],
         )
-
-    @property
-    def address(self) -> str:
-        return f"replay:{self.recording.source}"
 
     def _wait_until(self, due_ns: int) -> None:
         while not self._closed and (left_ns := due_ns - time.perf_counter_ns()) > 0:

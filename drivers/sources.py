@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -212,6 +214,10 @@ def parse_source(text: str) -> SourceAddress:
     scheme, colon, rest = text.partition(":")
     kind = next((row for row in KINDS if row.scheme == scheme.lower()), None)
     if not colon or kind is None:
+        if meant := _meant(text):
+            raise InputError(
+                f"'{text}' is not a source; did you mean {meant}? `tonguetrack devices` lists all."
+            )
         forms = ", ".join(row.forms for row in KINDS)
         raise InputError(f"'{text}' is not a source; sources are {forms} (see `tonguetrack devices`).")
     place, question, query = rest.rpartition("?") if "?" in rest else (rest, "", "")
@@ -241,6 +247,15 @@ def parse_source(text: str) -> SourceAddress:
     return SourceAddress(kind, text, host=host, port=port, options=options)
 
 
+def _meant(text: str) -> str:
+    """The address of a port or a file that was named without its kind; "" where it looks like neither."""
+    if re.fullmatch(r"COM\d+|/dev/[\w./-]+", text, re.ASCII | re.IGNORECASE):
+        return f"ndi://{text}"
+    if re.match(r"[A-Za-z]:[\\/]", text) or os.path.exists(text):
+        return f"replay:{text}"
+    return ""
+
+
 def open_device(address: SourceAddress) -> Source:
     """Opens what `parse_source` gave, apart from `simulate:`, which the tracker opens.
 
@@ -260,12 +275,18 @@ def open_replay(address: SourceAddress) -> Source:
     if address.option("speed") != "max":
         speed = address.number("speed", 1.0, 1e-3, 1e3)
     loop = address.choice("loop", "0", ("0", "1")) == "1"
-    recording = open_recording(
-        address.path,
-        rate_hz=address.number("rate", 0.0, 1e-3, 1e6) or None,
-        unit=address.option("unit") or None,
-        layout=address.option("layout") or None,
-    )
+    try:
+        recording = open_recording(
+            address.path,
+            rate_hz=address.number("rate", 0.0, 1e-3, 1e6) or None,
+            unit=address.option("unit") or None,
+            layout=address.option("layout") or None,
+        )
+    except InputError as reason:
+        flag = re.search(r"--(rate|unit|layout)\b", str(reason))
+        if flag is None:
+            raise
+        raise InputError(f"{reason} In a source's address this is ?{flag[1]}=...") from reason
     return ReplaySource(recording, speed, loop)
 
 

@@ -243,6 +243,10 @@ def statuses_in(datagram):
         (["ndi:///dev/there-is-no-such-port"], "/dev/there-is-no-such-port"),
         (["replay:nothing.csv"], "there is no such file"),
         (["simulate:?coils=tongue_tap"], "the coil 'tongue_tap' is unknown"),
+        (
+            ["simulate:", "--coils", "Ch1=tongue_tip"],
+            "--coils names the channel 'Ch1', which simulate: does not have",
+        ),
         (["simulate:", "--osc", "nowhere"], "expected HOST:PORT"),
         (["simulate:", "--session", "nothing.toml"], "there is no such session file"),
         (["simulate:", "--control", "127.0.0.1:99999"], "99999"),

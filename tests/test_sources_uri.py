@@ -1,6 +1,7 @@
 """Sources by their address: every form, every wrong form in a sentence, and nothing else whatever is typed."""
 
 import importlib
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,13 @@ from hypothesis import strategies as st
 from tonguetrack import InputError
 from tonguetrack.drivers.files.writing import write_recording
 from tonguetrack.drivers.frames import Recording
-from tonguetrack.drivers.sources import KINDS, MAX_ADDRESS_LENGTH, open_device, open_replay, parse_source
+from tonguetrack.drivers.sources import (
+    KINDS,
+    MAX_ADDRESS_LENGTH,
+    open_device,
+    open_replay,
+    parse_source,
+)
 
 # What is an address -----------------------------------------------------------------------------------
 
@@ -120,6 +127,28 @@ def test_every_opener_of_the_table_exists():
 def test_what_is_no_address_is_refused_in_a_sentence(text, reason):
     with pytest.raises(InputError, match=reason):
         parse_source(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        ("COM3", "ndi://COM3"),
+        ("/dev/ttyUSB0", "ndi:///dev/ttyUSB0"),
+        ("C:\\Users\\Anna\\take.xdf", "replay:C:\\Users\\Anna\\take.xdf"),
+        (__file__, f"replay:{__file__}"),
+    ],
+)
+def test_a_port_or_a_file_without_its_kind_is_told_with_it(text, meant):
+    with pytest.raises(InputError, match=re.escape(f"is not a source; did you mean {meant}?")):
+        parse_source(text)
+    assert parse_source(meant).path
+
+
+def test_a_replay_that_needs_to_be_told_more_is_told_how_in_an_address(tmp_path):
+    (tmp_path / "a.csv").write_text("tip_x,tip_y,tip_z\n" + "1,2,3\n" * 20, encoding="utf-8")
+    with pytest.raises(InputError, match=r"--rate.*In a source's address this is \?rate=\.\.\."):
+        open_device(parse_source(f"replay:{tmp_path / 'a.csv'}?unit=mm"))
+    assert open_device(parse_source(f"replay:{tmp_path / 'a.csv'}?rate=200&unit=mm")).rate_hz == 200.0
 
 
 PIECES = [kind.scheme for kind in KINDS] + [name for kind in KINDS for name in kind.options]

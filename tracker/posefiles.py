@@ -34,8 +34,10 @@ _HEADER_FIELDS = ("model_path", "model_fingerprint", "model_name", "recording", 
 def check_pose_suffix(path: str | Path) -> None:
     """Raises InputError for a name that `write_poses` could not write."""
     if Path(path).suffix.lower() not in POSE_SUFFIXES:
+        from_take = "; `tonguetrack take export --what poses` gets them out of a take"
         raise InputError(
-            f"{path}: poses are written as {', '.join(POSE_SUFFIXES)}; end the name in one of them."
+            f"{path}: poses are written as {', '.join(POSE_SUFFIXES)}; end the name in one of them"
+            f"{from_take if Path(path).suffix.lower() == '.xdf' else ''}."
         )
 
 

@@ -51,7 +51,7 @@ def complete_setup(recording: Recording, model: TongueModel, session: Session) -
     channels, roles = tuple(coil_map.tongue), tuple(coil_map.tongue.values())
     preparation = Preparation(picked_channels(recording.coils, channels), session.alignment)
     decisions.append(
-        f"alignment ({'default' if session.source == NO_SESSION else 'session'}): {session.alignment}"
+        f"alignment ({'default' if session.source in (NO_SESSION, '--coils') else 'session'}): {session.alignment}"
     )
     decisions.extend(_frame_hints(recording, session))
     _check_speaker(model, session)
@@ -104,9 +104,10 @@ def _coil_map(recording: Recording, session: Session) -> CoilMap:
         return guess_coil_map(recording.coils, recording.positions, recording.source)
     for channel in session.coils:
         if channel not in recording.coils:
+            where = session.source if session.source == "--coils" else f"{session.source}: [coils]"
             raise InputError(
-                f"{session.source}: [coils] names the channel '{channel}', which {recording.source} does not have; "
-                f"its channels are {', '.join(recording.coils)}."
+                f"{where} names the channel '{channel}', which {recording.source} does not have; its channels are "
+                f"{', '.join(recording.coils)}; say which of them is which coil with --coils CHANNEL=ROLE,..."
             )
     return checked_coil_map(session.coils, session.source)
 
@@ -146,11 +147,11 @@ def _frame_hints(recording: Recording, session: Session) -> list[str]:
         return []
     axes = suggested_axes(recording.frame)
     if axes is None:
-        return (
-            [f"note: the file's axes are {recording.frame}; an [alignment] may be needed"]
-            if "unknown" in known
-            else []
+        unknown = (
+            f"note: how the axes of {recording.source} lie to the model's is not known ({recording.frame}); unless "
+            "they agree, the session needs an [alignment]"
         )
+        return [unknown] if "unknown" in known else []
     if np.array_equal(axis_mapping(axes), np.eye(3)):
         return []
     hint = (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from .. import InputError
 from ..drivers.replay import ReplaySource
 from ..drivers.sources import Source, SourceAddress, open_device, parse_source
@@ -34,4 +36,4 @@ def _synthetic(address: SourceAddress) -> Source:
             head_motion=address.choice("head_motion", "0", ("0", "1")) == "1",
         )
     )
-    return ReplaySource(recording, loop=True)
+    return ReplaySource(replace(recording, source=address.text), loop=True, address=address.text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import select
 import socket
 import time
@@ -138,15 +139,33 @@ def open_serial(path: str, baud: int = 9600) -> SerialLink:
 
     try:
         # Only ports of this host can be locked, or give up writing: a network's own end does that elsewhere.
-        options: dict[str, Any] = {} if "://" in path else {"exclusive": True, "write_timeout": SEND_TIMEOUT_S}
+        options: dict[str, Any] = (
+            {} if "://" in path else {"exclusive": True, "write_timeout": SEND_TIMEOUT_S}
+        )
         port = serial.serial_for_url(path, baudrate=baud, timeout=SERIAL_WAIT_S, **options)
     except (OSError, ValueError) as reason:
-        raise LinkLost(f"{path}: {_words(reason)}") from reason
+        raise LinkLost(f"{path}: {_why_not_opened(reason)}") from reason
     try:
         port.set_low_latency_mode(True)
     except (AttributeError, NotImplementedError, OSError, ValueError):
         pass  # only some adapters on Linux have it
     return SerialLink(port, path)
+
+
+def _why_not_opened(reason: OSError | ValueError) -> str:
+    """In words of ours where it is known; the library's own repeat the port's name and quote numbers."""
+    text = _words(reason)
+    if "RFC2217" in text:
+        return "what answers there is no serial port server (RFC 2217)"
+    if "configure port" in text or getattr(reason, "errno", None) in (errno.EISDIR, errno.ENOTTY):
+        return "this is no serial port; `tonguetrack devices` lists those of this machine"
+    if "exclusively lock" in text:
+        return "another program has this port open"
+    if getattr(reason, "errno", None) in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+        return "there is no such serial port; `tonguetrack devices` lists those of this machine"
+    if getattr(reason, "errno", None) in (errno.EACCES, errno.EPERM):
+        return "no permission to open this port; `tonguetrack doctor` says how to get it"
+    return text
 
 
 def _words(reason: BaseException) -> str:

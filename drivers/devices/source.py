@@ -164,7 +164,8 @@ class DeviceSource:
                 self._queue.append(item)
                 if verdict is Verdict.GAP:
                     missing = self._clock.missing
-                    return self._note(NoteKind.GAP, f"{missing} frames are missing", missing)
+                    text = "1 frame is missing" if missing == 1 else f"{missing} frames are missing"
+                    return self._note(NoteKind.GAP, text, missing)
                 return self._note(NoteKind.CLOCK_RESET, "the device's clock jumped")
         raise StopIteration
 

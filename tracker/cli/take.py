@@ -179,6 +179,6 @@ def _percentages(shares: dict[str, float]) -> str:
 
 def _clock(seconds: float) -> str:
     """1:02:03 or 2:03."""
-    whole = int(seconds)
+    whole = round(seconds)
     minutes = f"{whole // 60 % 60}:{whole % 60:02d}"
     return f"{whole // 3600}:{minutes:>05}" if whole >= 3600 else minutes

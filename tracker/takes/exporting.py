@@ -32,7 +32,7 @@ def check_export(what: str, output: Path) -> None:
     """Raises InputError for a name whose ending does not fit."""
     if output.suffix.lower() not in SUFFIXES[what]:
         raise InputError(
-            f"{output}: the {what} of a take can be written as {', '.join(SUFFIXES[what])}; end the name in one of "
+            f"{output}: {what} of a take can be written as {', '.join(SUFFIXES[what])}; end the name in one of "
             "them, or choose something else with --what."
         )
 
