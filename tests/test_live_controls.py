@@ -18,8 +18,11 @@ from tonguetrack.tracker.served import obey_client
 from tonguetrack.tracker.status import LiveStatus
 from tonguetrack.tracker.takes.describing import take_info
 from tonguetrack.tracker.takes.keeper import TakeKeeper, check_place
+from tonguetrack.tracker.takes.reading import read_take
+from tonguetrack.tracker.takes.retrack import retrack
 
 RATE_HZ = 250.0
+ROLES = ("tongue_tip", "tongue_blade", "tongue_dorsum", "tongue_back", "tongue_left")
 
 
 class Script:
@@ -66,7 +69,9 @@ class Background:
 
 @pytest.fixture(scope="module")
 def take(small_model):
-    return made_up_recording(small_model, 400, RATE_HZ)
+    recording, setup = made_up_recording(small_model, 400, RATE_HZ)
+    session = replace(setup.session, coils=dict(zip(recording.coils, ROLES, strict=True)))
+    return recording, replace(setup, session=session, roles=ROLES)
 
 
 def freed(setup):
@@ -219,6 +224,46 @@ def test_a_later_run_with_the_same_place_numbers_its_take(small_model, take, tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == ["take-2.xdf", "take.xdf"]
 
 
+def test_a_take_that_begins_while_the_device_is_gone_has_the_marks_of_that_time(small_model, take, tmp_path):
+    recording, setup = take
+    controls = ControlQueue()
+    tracker = Tracker(small_model, setup, RATE_HZ, watchful=True)
+    gone = SourceNote(NoteKind.DISCONNECTED, "the line is cut", time.perf_counter_ns())
+    silent = SourceNote(NoteKind.SILENT, "not connected", time.perf_counter_ns())
+    items = [
+        *frames_of(recording, range(10)),
+        gone,
+        asked(controls, "take_start"),
+        silent,
+        lambda: keeper.wait(),
+        silent,
+        lambda: controls.put(Control("mark", "while it was gone", time.perf_counter_ns())),
+        silent,
+        *frames_of(recording, range(10, 30)),
+    ]
+    source = Script(items, recording.coils)
+    keeper = TakeKeeper(tmp_path, lambda frame: take_info(source, frame, small_model, tracker.setup, RATE_HZ))
+    run(small_model, setup, items, tracker, keeper=keeper, controls=controls)
+    found = read_take(tmp_path / "take-001.xdf")
+    assert found.frame_count == 20
+    assert [mark.text for mark in found.markers] == ["while it was gone"]
+    assert retrack(found, small_model).same
+
+
+def test_a_take_that_was_refused_at_the_very_end_is_told(small_model, take, tmp_path):
+    recording, setup = take
+    controls, told = ControlQueue(), []
+
+    def describe(frame):
+        raise InputError("no take today.")
+
+    items = [*frames_of(recording, range(10)), asked(controls, "take_start"), *frames_of(recording, [10])]
+    keeper = TakeKeeper(tmp_path, describe)
+    _, summary = run(small_model, setup, items, keeper=keeper, controls=controls, said=told.append)
+    assert told == ["no take today."]
+    assert summary.frames == 11 and summary.takes == ()
+
+
 def test_places_that_cannot_be_are_refused_before_anything_is_opened(tmp_path):
     (tmp_path / "there.xdf").write_bytes(b"")
     (tmp_path / "file").write_bytes(b"")
@@ -274,3 +319,19 @@ def test_without_coils_after_a_gap_no_number_on_the_stream_is_missing(small_mode
         pose = tracker.step(frame)
         assert np.isfinite(pose.weights).all() and np.isfinite(pose.normalised).all()
         assert pose.status == (PoseStatus.LOST if 100 <= frame.frame_number < 200 else PoseStatus.OK)
+
+
+def test_a_line_that_nobody_reads_ends_no_run(monkeypatch):
+    from tonguetrack.tracker.cli.watching import say_above
+
+    class Closed:
+        def isatty(self):
+            return False
+
+        def write(self, text):
+            raise BrokenPipeError
+
+        flush = None
+
+    monkeypatch.setattr("sys.stderr", Closed())
+    say_above("nobody hears this")

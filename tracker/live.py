@@ -114,6 +114,7 @@ class LiveRun:
         finally:
             if self.keeper is not None:
                 self.keeper.close()
+                self._say_refusal(self.keeper)
         takes = self.keeper.finished if self.keeper is not None else ()
         return summarise(self.info, self.status, _lateness(self.source), takes)
 
@@ -124,17 +125,17 @@ class LiveRun:
         changes = tracker.changes
         end = _End(self.seconds, 1.0 / self.source.rate_hz if self.source.rate_hz else tracker.period_s)
         for item in self.source:
+            if keeper is not None:
+                if status.frames == 0 and isinstance(item, CoilFrame):
+                    keeper.first_frame(item)
+                if keeper.recorder is not recorder:
+                    recorder = self._take(keeper.recorder, item.arrival_ns)
             if not isinstance(item, CoilFrame):
                 if not self._note(item, recorder):
                     break
                 if item.kind is NoteKind.CLOCK_RESET:
                     end.begin_anew()
             else:
-                if keeper is not None:
-                    if status.frames == 0:
-                        keeper.first_frame(item)
-                    if keeper.recorder is not recorder:
-                        recorder = self._take(keeper.recorder, item.arrival_ns)
                 if tracker.changes != changes:
                     changes = tracker.changes
                     self._pass_on(recorder, item.arrival_ns)
@@ -159,8 +160,12 @@ class LiveRun:
                 if not self._obey(control, recorder):
                     return
             if keeper is not None and keeper.refusal:
-                self.said(keeper.refusal)
-                keeper.refusal = ""
+                self._say_refusal(keeper)
+
+    def _say_refusal(self, keeper: TakeKeeper) -> None:
+        refusal, keeper.refusal = keeper.refusal, ""
+        if refusal:
+            self.said(refusal)
 
     def _take(self, recorder: TakeRecorder | None, next_arrival_ns: int) -> TakeRecorder | None:
         """A take begins or has ended. It begins with a tracker that knows nothing, as its replay will."""

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 from ..kernelcache import cache_lasts
@@ -63,7 +63,7 @@ def watched(source: FrameSource, status: LiveStatus) -> Iterator[None]:
 
 @contextmanager
 def stopped_by_signals(source: FrameSource) -> Iterator[threading.Event]:
-    """The first Ctrl-C, or a request to terminate, stops the source, so that the run ends as at its last frame;
+    """The first Ctrl-C, request to terminate, or end of the terminal stops the source, so that the run ends as at its last frame;
     a second one interrupts. The event is set once that has happened."""
     stopped = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -71,6 +71,8 @@ def stopped_by_signals(source: FrameSource) -> Iterator[threading.Event]:
         return
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # not under nohup
+        before[signal.SIGHUP] = signal.SIG_DFL
 
     def stop(number: int, frame: FrameType | None) -> None:
         restore()
@@ -145,8 +147,12 @@ def _take_text(status: LiveStatus) -> str:
 
 
 def say_above(text: str) -> None:
-    """A line for a person, in the place of the status line, which comes again below it."""
-    _say((_blank_line() if sys.stderr.isatty() else "") + text)
+    """A line for a person, in the place of the status line, which comes again below it.
+
+    That nobody reads stderr any more ends no run.
+    """
+    with suppress(OSError, ValueError):
+        _say((_blank_line() if sys.stderr.isatty() else "") + text)
 
 
 def _blank_line() -> str:
