@@ -38,6 +38,7 @@ ROLES = (
     "bite_front",
     "bite_left",
     "bite_right",
+    "bite_back",
     "palate_probe",
 )
 
