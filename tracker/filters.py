@@ -15,13 +15,16 @@ from .kernels import FARTHEST_MM, OPTIONS
 from .pose import FloatArray
 
 STOP_BAND_DB = 60.0
-"""How far a FIR filter is down at its stop frequency, and how far its ripple is from 1 in the pass band."""
+"""How far a FIR filter is down from its stop frequency on."""
 GAUSSIAN_SIGMAS = 4.0
 """Where the Gaussian's two sides are cut off."""
 SETTLED = 1e-9
 """What is left of a recursive filter's start when the first true sample comes."""
 MOST_TURNS = 10
 """A run is continued by at most so many of its own lengths: its mean is zero by then, nothing slow is left in it."""
+
+SHORTEST_STEP_S = 1e-6
+"""No device is as fast: a time that is nearer to the one before is a stamp that came twice."""
 
 UNFILTERED, ONE_POLE, ONE_EURO, FIR = 0, 1, 2, 3
 
@@ -36,7 +39,7 @@ MEMORY_COLUMNS = 11
 
 
 def fir_taps(pass_hz: float, stop_hz: float, rate_hz: float) -> FloatArray:
-    """(odd number,) a Kaiser-windowed low-pass: at most 60 dB of ripple up to pass_hz, 60 dB down from stop_hz on."""
+    """(odd number,) a Kaiser-windowed low-pass: within 0.02 dB of 1 up to pass_hz, 60 dB down from stop_hz on."""
     from scipy.signal import firwin, kaiserord
 
     width = (stop_hz - pass_hz) / (rate_hz / 2.0)
@@ -141,12 +144,13 @@ def smooth_frame(
     past: FloatArray,
     out: FloatArray,
 ) -> None:
-    """One frame raw (n, 3), mm, step_s > 0 after the one before, into out (n, 3), which may be raw itself.
+    """One frame raw (n, 3), mm, into out (n, 3), which may be raw itself.
 
-    kinds (n,): UNFILTERED, ONE_POLE, ONE_EURO or FIR; settings (n, 3): the cut-off, Hz; for ONE_EURO then beta, 1/mm,
-    and the cut-off of its velocity, Hz. taps (n, longest), lengths (n,): of FIR. memory (n, MEMORY_COLUMNS), zeros at
-    the start; past (n, longest, 3): the last raw samples of FIR, in a ring. A coil with a coordinate that is not a
-    number, or beyond FARTHEST_MM, is passed on as it is and forgotten.
+    step_s: since the frame before, at least SHORTEST_STEP_S. kinds (n,): UNFILTERED, ONE_POLE, ONE_EURO or FIR;
+    settings (n, 3): the cut-off, Hz; for ONE_EURO then beta, 1/mm, and the cut-off of its velocity, Hz. taps (n,
+    longest), lengths (n,): of FIR. memory (n, MEMORY_COLUMNS), zeros at the start; past (n, longest, 3): the last raw
+    samples of FIR, in a ring. A coil with a coordinate that is not a number, or beyond FARTHEST_MM, is passed on as
+    it is and forgotten.
     """
     for i in range(raw.shape[0]):
         kind = kinds[i]

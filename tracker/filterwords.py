@@ -130,7 +130,8 @@ def parse_filter(text: str) -> Filter:
     """The filter that a text names; `str` of it gives the text back. Raises InputError that shows what there is."""
     for name, kind in _KINDS.items():
         for form in filter(None, (kind.text, kind.short)):
-            pattern = re.escape(form).replace(r"\{\}", _NUMBER).replace(r"\ ", r"\s*")
+            words = re.escape(form).replace(r"\ ", r"\s*").replace(r"\-", r"\s*-\s*")
+            pattern = words.replace(r"\{\}", _NUMBER)
             if found := re.fullmatch(pattern, text.strip(), re.IGNORECASE):
                 numbers = tuple(map(float, found.groups()))
                 return Filter(name, numbers + (kind.defaults if form == kind.short else ()))

@@ -22,30 +22,32 @@ from .kernels import FARTHEST_MM
 from .pose import FloatArray
 
 GROUPS = ("tongue", "jaw_and_lips", "references", "all")
+# Live, a one-pole filter of about twice the cut-off: the lag of the same one on a moving tongue is larger than the
+# noise that it takes away. References move slowly, but late ones displace all other coils when the head turns.
 _PRESETS: dict[str, tuple[dict[str, str], dict[str, str], str]] = {
     "carstens": (
         {"all": "fir 40-50 Hz", "references": "fir 5-15 Hz"},
-        {"all": "one-pole 40 Hz", "references": "one-pole 10 Hz"},
+        {"all": "one-pole 80 Hz", "references": "one-pole 20 Hz"},
         "what the Carstens AG501's own NormPos does: 40-50 Hz for articulators, 5-15 Hz for the references",
     ),
     "tardis": (
         {"all": "butterworth 20 Hz order 5"},
-        {"all": "one-pole 20 Hz"},
+        {"all": "one-pole 40 Hz"},
         "AG501 recordings prepared in R, as with the package tardis",
     ),
     "haskins": (
         {"all": "butterworth 20 Hz order 5"},
-        {"all": "one-pole 20 Hz"},
+        {"all": "one-pole 40 Hz"},
         "Haskins recordings (HPRC) in studies of articulatory inversion; the order is ours",
     ),
     "ema2wav": (
         {"all": "butterworth 25 Hz order 4"},
-        {"all": "one-pole 25 Hz"},
+        {"all": "one-pole 50 Hz"},
         "the example settings of ema2wav",
     ),
     "mocha": (
         {"all": "butterworth 10 Hz order 5"},
-        {"all": "one-pole 10 Hz"},
+        {"all": "one-pole 20 Hz"},
         "MOCHA, mngu0 and USC recordings in studies of articulatory inversion; the order is ours",
     ),
 }
@@ -260,13 +262,13 @@ class CausalSmoother:
     def step(self, raw: FloatArray, step_s: float, out: FloatArray) -> None:
         """Smooths raw (n, 3), mm, NaN = missing, into out (n, 3), which may be raw itself. Nothing is allocated.
 
-        step_s: time since the frame before, s; where it is not above 0 (a device without a clock, a stamp that comes
-        twice) the nominal one. Both arrays are writable float64 in C order. A missing coil stays missing and starts
-        anew when it comes back. FIR filters count frames, not seconds: after a gap, `reset`.
+        step_s: time since the frame before, s; below filters.SHORTEST_STEP_S (a device without a clock, a stamp that
+        comes twice) the nominal one is taken. Both arrays are writable float64 in C order. A missing coil stays
+        missing and starts anew when it comes back. FIR filters count frames, not seconds: after a gap, `reset`.
         """
         mathematics.smooth_frame(
             raw,
-            step_s if step_s > 0.0 else self._nominal_s,
+            step_s if step_s >= mathematics.SHORTEST_STEP_S else self._nominal_s,
             self._kinds,
             self._settings,
             self._taps,
