@@ -66,19 +66,26 @@ def zero_phase_taps(run: FloatArray, taps: FloatArray) -> FloatArray:
     return line + convolve(_continued(run - line, len(taps) // 2), taps[:, None], "valid")
 
 
-def zero_phase_butterworth(run: FloatArray, cutoff_hz: float, order: int, rate_hz: float) -> FloatArray:
-    """The run (frames, 3) through a Butterworth low-pass of this order, forwards and backwards.
+def butterworth(cutoff_hz: float, order: int, rate_hz: float) -> tuple[FloatArray, int]:
+    """Sections (k, 6) of a low-pass, and after how many frames its start is forgotten.
 
-    Both ways together halve the amplitude at cutoff_hz (-6 dB) and fall twice as fast as one.
+    Forwards and backwards it halves the amplitude at cutoff_hz (-6 dB) and falls twice as fast as one way.
     """
-    from scipy.signal import butter, sosfiltfilt
+    from scipy.signal import butter
+
+    slowest = np.abs(butter(order, cutoff_hz, output="zpk", fs=rate_hz)[1]).max()
+    settled = int(np.ceil(np.log(SETTLED) / np.log(slowest))) if slowest > 0.0 else 1
+    return np.asarray(butter(order, cutoff_hz, output="sos", fs=rate_hz)), settled
+
+
+def zero_phase_sections(run: FloatArray, sections: FloatArray, settled: int) -> FloatArray:
+    """The run (frames, 3) forwards and backwards through a `butterworth`."""
+    from scipy.signal import sosfiltfilt
 
     if len(run) < 3:
         return run.copy()
-    poles = np.abs(butter(order, cutoff_hz, output="zpk", fs=rate_hz)[1]).max()
-    padding = min(int(np.ceil(np.log(SETTLED) / np.log(poles))), MOST_TURNS * len(run)) if poles > 0 else 1
+    padding = min(settled, MOST_TURNS * len(run))
     line = _chord(run)
-    sections = butter(order, cutoff_hz, output="sos", fs=rate_hz)
     smooth = sosfiltfilt(sections, _continued(run - line, padding), axis=0, padtype=None, padlen=0)
     return line + smooth[padding : padding + len(run)]
 

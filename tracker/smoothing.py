@@ -195,7 +195,7 @@ def smooth(positions: FloatArray, rate_hz: float, filters: Sequence[Filter | Non
         smoothed = _zero_phase(chosen, rate_hz)
         track = result[:, coil]
         with np.errstate(invalid="ignore"):
-            present = (np.abs(track) <= FARTHEST_MM).all(axis=1)
+            present = np.asarray((np.abs(track) <= FARTHEST_MM).all(axis=1))
         for run in mathematics.runs_of(present):
             track[run] = smoothed(track[run])
     return result
@@ -208,11 +208,10 @@ def _zero_phase(chosen: Filter, rate_hz: float) -> Callable[[FloatArray], FloatA
         return partial(mathematics.running_median, frames=int(values[0]))
     _check_rate(chosen, rate_hz)
     if chosen.kind == "butterworth":
-        return partial(
-            mathematics.zero_phase_butterworth, cutoff_hz=values[0], order=int(values[1]), rate_hz=rate_hz
-        )
+        sections, settled = mathematics.butterworth(values[0], int(values[1]), rate_hz)
+        return partial(mathematics.zero_phase_sections, sections=sections, settled=settled)
     if chosen.kind == "fir":
-        taps = mathematics.fir_taps(*values, rate_hz)
+        taps = mathematics.fir_taps(values[0], values[1], rate_hz)
     else:
         taps = mathematics.gaussian_taps(values[0] / 1000.0 * rate_hz)
     return partial(mathematics.zero_phase_taps, taps=taps)
@@ -241,7 +240,7 @@ class CausalSmoother:
             self._nominal_s = 1.0 / rate_hz
             if chosen.kind == "fir":
                 self._kinds[coil] = mathematics.FIR
-                designs[coil] = mathematics.fir_taps(*chosen.values, rate_hz)
+                designs[coil] = mathematics.fir_taps(chosen.values[0], chosen.values[1], rate_hz)
                 self._lengths[coil] = len(designs[coil])
                 self.delays_s[coil] = (len(designs[coil]) - 1) / 2 / rate_hz
             elif chosen.kind == "one-pole":
