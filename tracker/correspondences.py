@@ -55,7 +55,7 @@ def typical_frame(coils: FloatArray) -> int:
 
     Raises InputError where no frame has them all.
     """
-    complete = _complete_frames(coils)
+    complete = complete_frames(coils)
     shapes = coils[complete].reshape(len(complete), -1)
     return int(complete[np.argmin(np.sum((shapes - np.median(shapes, axis=0)) ** 2, axis=1))])
 
@@ -92,14 +92,14 @@ def estimate_correspondences(
         return tuple(int(place) for place in chosen)
 
     target = coils[typical_frame(coils)]
-    complete = _complete_frames(coils)
+    complete = complete_frames(coils)
     spread = np.unique(np.linspace(0, len(complete) - 1, COMPARED_FRAMES).astype(int))
     frames = np.ascontiguousarray(coils[complete[spread]])
     best = min(
         (search.settled(start, target, nearest) for start in search.random_starts()),
         key=lambda chosen: search.mean_distances(chosen, frames).mean(),
     )
-    best = _slid_along_contour(
+    best = slid_along_contour(
         best, middle, len(contour), lambda c: float(search.mean_distances(c, frames).mean())
     )
     return Correspondences(
@@ -162,7 +162,7 @@ class _Search:
         return self._distances[chosen]
 
 
-def _slid_along_contour(
+def slid_along_contour(
     best: Places, middle: Sequence[int], contour_length: int, cost: Callable[[Places], float]
 ) -> Places:
     """Moves one coil at a time along the contour, in halving strides, while the cost falls."""
@@ -187,7 +187,8 @@ def _slid_along_contour(
     return best
 
 
-def _complete_frames(coils: FloatArray) -> NDArray[np.intp]:
+def complete_frames(coils: FloatArray) -> NDArray[np.intp]:
+    """Indices of the frames of coils (frames, n, 3) that have every coil. InputError where none has."""
     complete = np.flatnonzero(np.isfinite(coils).all(axis=(1, 2)))
     if len(complete) == 0:
         raise InputError(
