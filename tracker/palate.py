@@ -33,7 +33,7 @@ FEWEST_IN_BIN = 3
 ON_PALATE_MM = 1.0  # samples this near to the curve were on the palate
 ROUNDS = 4
 LONGEST_GAP_MM = 5.0  # between two places that were swept; beyond a longer one nothing is believed
-SMOOTHING_LENGTH_MM = 5.0  # bumps shorter than this are smoothed away
+SMOOTHING_LENGTH_MM = 3.5  # bumps shorter than this are smoothed away
 SHORTEST_MM, LONGEST_MM = 15.0, 120.0  # of a palate, front to back
 MOST_POINTS = 10_000
 PROBE_RATE_HZ = 250.0
@@ -312,6 +312,8 @@ def _palate_from_trace(
             f"{source}: in {unit} the trace extends {extent:.4g} mm front to back, a palate {SHORTEST_MM:.0f} to "
             f"{LONGEST_MM:.0f} mm; check the unit and the axes."
         )
+    if len(points) > FEWEST_IN_BIN * extent / BIN_MM:  # the samples of a probe rather than a drawn curve
+        return palate_from_sweep(points, frame, source)
     return curve_palate(points, source, frame)
 
 
@@ -351,7 +353,8 @@ def model_palate(model: TongueModel) -> Palate:
 
     Tongues reach the palate in some of their poses: the highest z, by 1 mm front to back, of the mid-sagittal
     contours over the model's training poses (as far as they are within two sigma), for the mean anatomy. For use
-    where there is no palate trace; a real palate is a little higher.
+    where there is no palate trace; a real palate is some millimetres higher, for poses are averaged and no tongue fills
+    it everywhere.
     """
     contour = [int(vertex) for vertex in midsagittal_vertices(model)]
     speaker = model.at(contour).for_speaker(model.speaker.mean)
@@ -365,11 +368,23 @@ def model_palate(model: TongueModel) -> Palate:
     y = np.arange(np.floor(contours[..., 1].min()), np.ceil(contours[..., 1].max()) + BIN_MM, BIN_MM)
     highest = np.fmax.reduce([_contour_height(contour, y) for contour in contours])
     y, highest = y[np.isfinite(highest)], highest[np.isfinite(highest)]
-    apex = int(np.argmax(highest))
-    falling = np.flatnonzero(np.diff(highest[apex:]) < -STEEPEST_BACK * BIN_MM)
-    end = apex + int(falling[0]) + 1 if len(falling) else len(y)
+    end = _end_of_palate(highest)
+    if end * BIN_MM < SHORTEST_MM:
+        raise InputError(
+            f"the model '{model.name}' has an upper surface of only {end * BIN_MM:.0f} mm front to back below a palate; a "
+            f"tongue's has at least {SHORTEST_MM:.0f}, so this is no model of a tongue in mm."
+        )
     points = np.column_stack([np.zeros(end), y[:end], _smooth_curve(y[:end], highest[:end])(y[:end])])
     return Palate(points, f"the highest tongue of the model '{model.name}'")
+
+
+def _end_of_palate(highest: FloatArray) -> int:
+    """How many of the heights (n,), 1 mm apart front to back, come before the steep fall behind the highest."""
+    if len(highest) == 0:
+        return 0
+    apex = int(np.argmax(highest))
+    falling = np.flatnonzero(np.diff(highest[apex:]) < -STEEPEST_BACK * BIN_MM)
+    return apex + int(falling[0]) + 1 if len(falling) else len(highest)
 
 
 def _contour_height(contour: FloatArray, y: FloatArray) -> FloatArray:

@@ -57,7 +57,7 @@ class MidSagittalPlane:
     normal: (3,) unit vector, to the speaker's left; point: (3,) mm, the middle of the coils in the plane.
     spread_mm: robust standard deviation of the samples off the plane; offsets_mm: (n,) median of each coil off it,
     positive to the left. tilt_deg: angle between the normal and the left that was stated. unsure_deg: the
-    largest turn of the normal when one of the coils is left out, or what the scatter alone allows if that is more.
+    largest turn of the normal when one of the coils is left out; with fewer than three, what their scatter allows.
     """
 
     normal: FloatArray
@@ -113,11 +113,11 @@ def mid_sagittal_plane(positions: FloatArray, left: FloatArray, source: str) -> 
             f"{source}: the plane of its mid-sagittal coils is turned {tilt:.0f} degrees against the stated axes, more "
             f"than the {LARGEST_TILT_DEG:.0f} of a head held askew; a coil's role or the axes are wrong."
         )
-    unsure = float(np.rad2deg(extents[0] / extents[1] / np.sqrt(len(samples))))
     if len(samples) >= 3:
-        for without in range(len(samples)):
-            turned = _robust_plane(samples[:without] + samples[without + 1 :], left)[0]
-            unsure = max(unsure, _angle_deg(turned, normal))
+        others = [samples[:without] + samples[without + 1 :] for without in range(len(samples))]
+        unsure = max(_angle_deg(_robust_plane(rest, left)[0], normal) for rest in others)
+    else:
+        unsure = float(np.rad2deg(np.arctan(extents[0] / extents[1])))
     offsets = np.full(positions.shape[1], np.nan)
     offsets[there] = [float(np.median((coil - point) @ normal)) for coil in samples]
     return MidSagittalPlane(normal, point, spread, offsets, tilt, unsure)
