@@ -639,6 +639,24 @@ def prepare_frame(raw, picked, rotation, translation, project, coils):
 
 
 @njit(**OPTIONS)
+def prepare_on_moving_head(
+    raw, picked, head_rotation, head_translation, rotation, translation, project, still, coils
+):
+    """`prepare_frame` after the head's motion was taken out: rest = head_rotation' (raw - head_translation).
+
+    still: scratch (channels, 3). A frame whose motion is not known (NaN) has no coils.
+    """
+    for i in range(picked.shape[0]):
+        channel = picked[i]
+        for axis in range(3):
+            total = 0.0
+            for row in range(3):
+                total += head_rotation[row, axis] * (raw[channel, row] - head_translation[row])
+            still[channel, axis] = total
+    prepare_frame(still, picked, rotation, translation, project, coils)
+
+
+@njit(**OPTIONS)
 def prepare_frames(raw, picked, rotation, translation, project, coils):
     """`prepare_frame` for raw (frames, all coils, 3) into coils (frames, n, 3)."""
     for frame in range(raw.shape[0]):

@@ -155,7 +155,7 @@ class Tracker:
             step_s = self._advance(frame.device_time_s)
             status = self._watch(frame, step_s)
         else:
-            coils = self._preparation.frame(frame.positions)
+            coils = self._preparation.frame(frame.positions, step_s)
             status = solver.solve(coils)
             np.isnan(coils[:, 0], out=self._guard.states, casting="unsafe")  # MISSING = 1, TRUSTED = 0
         if self._averages and status == PoseStatus.OK:
@@ -175,7 +175,7 @@ class Tracker:
     def _watch(self, frame: CoilFrame, step_s: float) -> int:
         """Solves with the coils that can be trusted; the status."""
         solver, guard = self._solver, self._guard
-        coils = self._preparation.frame(frame.positions)
+        coils = self._preparation.frame(frame.positions, step_s)
         status = solver.solve(guard.admit(coils, self._time_s))
         residuals = solver.residuals_mm
         if not guard.all_counted:

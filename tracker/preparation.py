@@ -1,61 +1,129 @@
 """Raw coil positions in the source's frame -> the tracked coils in the model frame.
 
-The flow: pick the coils, (head correction, bite plane, palate: their place is here, between picking and
-aligning; not built yet), align rigidly, project into the mid-sagittal plane. The same compiled function
-serves one live frame and a whole recording, so both give the same bits.
+The flow: smooth, take the head's motion out, align rigidly, project into the mid-sagittal plane. One frame at a
+time and over a whole recording it is the same compiled code; only smoothing differs, which may look ahead in a
+recording and must not in a live run.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import InputError
 from . import kernels
+from .headcorrection import HeadCorrector, HeadReference, head_motion
 from .pose import FloatArray
 from .session import Alignment
+from .smoothing import NO_SMOOTHING, CausalSmoother, Smoothing, smooth
 
 
 class Preparation:
-    """picked: (n,) int64 indices of the tracked coils among the source's."""
+    """picked: (n,) int64 indices of the tracked coils among the source's, roles their roles.
 
-    def __init__(self, picked: NDArray[np.int64], alignment: Alignment) -> None:
+    head: the reference coils at rest; references: (k,) int64 indices of these coils among the source's.
+    rate_hz: of a live source, for its smoothing.
+    """
+
+    def __init__(
+        self,
+        picked: NDArray[np.int64],
+        alignment: Alignment,
+        roles: Sequence[str] = (),
+        head: HeadReference | None = None,
+        references: NDArray[np.int64] | None = None,
+        smoothing: Smoothing = NO_SMOOTHING,
+        rate_hz: float = 250.0,
+    ) -> None:
         self._picked = np.ascontiguousarray(picked, dtype=np.int64)
         self._rotation = np.array(alignment.rotation, dtype=np.float64, order="C")
         self._translation = np.array(alignment.translation_mm, dtype=np.float64)
         self._midsagittal = alignment.midsagittal
+        self._head = head
+        self._references = np.zeros(0, np.int64) if references is None else np.ascontiguousarray(references)
+        self._corrector = HeadCorrector(head) if head is not None else None
+        self.head_status = 0
+        self._head_rotation, self._head_translation = np.eye(3), np.zeros(3)
+        self._reference_positions = np.full((len(self._references), 3), np.nan)
+        self._smoothing = smoothing
+        # Channels in the order in which a frame is copied, with the role that says how each is smoothed.
+        head_roles = head.roles if head is not None else ()
+        self._role_of = dict(zip(self._picked.tolist(), roles, strict=False))
+        self._role_of |= dict(zip(self._references.tolist(), head_roles, strict=True))
         self.coils: FloatArray = np.full((len(self._picked), 3), np.nan)
         # Frames are copied here first: a read-only or strided array would be another type for the compiler.
         self._raw = np.zeros((self.channels_needed, 3))
+        self._still = np.zeros_like(self._raw)
+        live = [self._filter_of(channel, live=True) for channel in range(self.channels_needed)]
+        self._smoother = CausalSmoother(live, rate_hz) if any(live) else None
+        self._smooth_raw = np.zeros_like(self._raw)
+
+    def _filter_of(self, channel: int, live: bool) -> object:
+        role = self._role_of.get(channel)
+        return None if role is None else self._smoothing.of(role, live)
 
     @property
     def channels_needed(self) -> int:
         """The least number of channels that a raw frame must have."""
-        return int(self._picked.max()) + 1
+        return int(max(self._picked.max(), self._references.max(initial=-1))) + 1
 
-    def frame(self, raw: FloatArray) -> FloatArray:
-        """Fills and returns `self.coils` (n, 3) from raw (all coils, 3); NaN = missing in both."""
+    def reset(self) -> None:
+        """Forgets what was smoothed and where the head was, as after a jump in time."""
+        if self._smoother is not None:
+            self._smoother.reset()
+        if self._corrector is not None:
+            self._corrector.reset()
+
+    def frame(self, raw: FloatArray, step_s: float = 0.0) -> FloatArray:
+        """Fills and returns `self.coils` (n, 3) from raw (all coils, 3); NaN = missing in both.
+
+        step_s: time since the frame before, for smoothing.
+        """
         if len(raw) < len(self._raw):
             raise InputError(
                 f"a frame has {len(raw)} coils, but channel {len(self._raw)} is to be tracked; check what the "
                 "source sends."
             )
         self._raw[:] = raw[: len(self._raw)]
-        kernels.prepare_frame(
-            self._raw, self._picked, self._rotation, self._translation, self._midsagittal, self.coils
+        used = self._raw
+        if self._smoother is not None:
+            self._smoother.step(self._raw, step_s, self._smooth_raw)
+            used = self._smooth_raw
+        if self._corrector is None:
+            kernels.prepare_frame(
+                used, self._picked, self._rotation, self._translation, self._midsagittal, self.coils
+            )
+            return self.coils
+        np.take(used, self._references, axis=0, out=self._reference_positions)
+        self.head_status = self._corrector.step(
+            self._reference_positions, self._head_rotation, self._head_translation
         )
+        kernels.prepare_on_moving_head(
+            used, self._picked, self._head_rotation, self._head_translation, self._rotation, self._translation,
+            self._midsagittal, self._still, self.coils,
+        )  # fmt: skip
         return self.coils
 
-    def all_frames(self, raw: FloatArray) -> FloatArray:
-        """(frames, n, 3) from raw (frames, all coils, 3)."""
+    def all_frames(self, raw: FloatArray, rate_hz: float = 250.0) -> FloatArray:
+        """(frames, n, 3) from raw (frames, all coils, 3) of a recording with that rate."""
+        # A read-only array is another type for the compiler; such a one is copied.
+        raw = np.require(raw, np.float64, ["C_CONTIGUOUS", "WRITEABLE"])
+        filters = [self._filter_of(channel, live=False) for channel in range(self.channels_needed)]
+        if any(filters):
+            raw = np.ascontiguousarray(smooth(raw[:, : self.channels_needed], rate_hz, filters))
         prepared = np.empty((len(raw), len(self._picked), 3))
-        kernels.prepare_frames(
-            # A read-only array is another type for the compiler; such a one is copied.
-            np.require(raw, np.float64, ["C_CONTIGUOUS", "WRITEABLE"]),
-            self._picked,
-            self._rotation,
-            self._translation,
-            self._midsagittal,
-            prepared,
-        )
+        if self._head is None:
+            kernels.prepare_frames(
+                raw, self._picked, self._rotation, self._translation, self._midsagittal, prepared
+            )
+            return prepared
+        motion = head_motion(np.ascontiguousarray(raw[:, self._references]), self._head)
+        still = np.zeros(raw.shape[1:])
+        for frame in range(len(raw)):
+            kernels.prepare_on_moving_head(
+                raw[frame], self._picked, motion.rotations[frame], motion.translations[frame], self._rotation,
+                self._translation, self._midsagittal, still, prepared[frame],
+            )  # fmt: skip
         return prepared

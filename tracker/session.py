@@ -5,10 +5,23 @@
     [coils]                           # file channel = role
     t_tip = "tongue_tip"
 
+    [smoothing]                       # see `smoothing`
+    preset = "carstens"               # or recorded.tongue = "butterworth 20 Hz order 5", live.tongue = "one-pole 20 Hz"
+
+    [head]                            # where the reference coils are at rest, see `headcorrection`
+    source = "rest 0:2 of sweep 12"
+    [head.rest_mm]
+    head_left = [71.2, 90.1, 30.8]
+
     [alignment]                       # model = rotation source + translation, then the projection
     axes = ["-y", "-x", "z"]          # or rotation = [[...], [...], [...]]
     translation_mm = [0.0, 0.0, 0.0]
     midsagittal = true
+    source = "bite plane bp.pos, refined on 80 frames of sweep 12"
+
+    [palate]                          # in the model's frame, see `palate`
+    source = "palate sweep pal.pos"
+    points_mm = [[0.0, 4.0, 6.5], [0.0, 8.0, 9.1]]
 
     [correspondences]                 # role = vertex
     tongue_tip = 2469
@@ -20,8 +33,8 @@
     [energy]
     alpha = 1.0
 
-Whatever is absent is estimated or has its default, and the tracker says which. Head correction, bite
-plane and palate belong between [coils] and [alignment]; their tables are not read yet.
+Whatever is absent is estimated or has its default, and the tracker says which. A frame is smoothed, freed from
+the head's motion, aligned, and projected, in this order.
 """
 
 from __future__ import annotations
@@ -37,7 +50,10 @@ import numpy as np
 
 from .. import InputError
 from .coilmap import checked_coil_map
+from .headcorrection import HeadReference, head_from_toml, head_toml
+from .palate import Palate, palate_from_toml, palate_toml
 from .pose import FloatArray
+from .smoothing import NO_SMOOTHING, Smoothing, smoothing_from_toml, smoothing_toml
 
 MAX_SESSION_BYTES = 1024 * 1024
 LARGEST_TERM = 1e12  # of the energy's weights: beyond, float64 loses the other terms
@@ -52,12 +68,13 @@ class Alignment:
 
     rotation: (3, 3), orthonormal; it mirrors where the source is left-handed, or where an axis of
     two-dimensional data, all zeros, is turned round; translation_mm: (3,). midsagittal: afterwards the
-    lateral coordinate is set to 0, as the paper does with mid-sagittal coils.
+    lateral coordinate is set to 0, as the paper does with mid-sagittal coils. source: how it was found.
     """
 
     rotation: FloatArray = field(default_factory=lambda: np.eye(3))
     translation_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
     midsagittal: bool = False
+    source: str = ""
 
     @property
     def moves(self) -> bool:
@@ -116,6 +133,9 @@ class Session:
     energy: Energy = Energy()
     model_fingerprint: str = ""
     source: str = NO_SESSION
+    smoothing: Smoothing = NO_SMOOTHING
+    head: HeadReference | None = None
+    palate: Palate | None = None
 
 
 def load_session(path: str | Path) -> Session:
@@ -157,17 +177,21 @@ def session_toml(session: Session) -> str:
         document.add("model", tomlkit.item(session.model_fingerprint))
         document["model"].comment("the model that vertices and speaker belong to")
     _add_table(document, "coils", "file channel = role", dict(session.coils))
+    if session.smoothing != NO_SMOOTHING:
+        _add_table(document, "smoothing", "before anything else", smoothing_toml(session.smoothing))
+    if session.head is not None:
+        _add_table(document, "head", "the reference coils at rest, in the device's axes", head_toml(session.head))
     alignment = session.alignment
-    _add_table(
-        document,
-        "alignment",
-        "model = rotation source + translation, then the projection",
-        {
-            "rotation": alignment.rotation.tolist(),
-            "translation_mm": alignment.translation_mm.tolist(),
-            "midsagittal": alignment.midsagittal,
-        },
-    )
+    stated: dict[str, Any] = {
+        "rotation": alignment.rotation.tolist(),
+        "translation_mm": alignment.translation_mm.tolist(),
+        "midsagittal": alignment.midsagittal,
+    }
+    if alignment.source:
+        stated["source"] = alignment.source
+    _add_table(document, "alignment", "model = rotation source + translation, then the projection", stated)
+    if session.palate is not None:
+        _add_table(document, "palate", "in the model's frame", palate_toml(session.palate))
     _add_table(document, "correspondences", "role = vertex", dict(session.correspondences))
     if session.speaker_weights is not None:
         speaker = {"weights": session.speaker_weights.tolist(), "source": session.speaker_source}
@@ -188,7 +212,7 @@ def _add_table(document: Any, name: str, comment: str, content: Mapping[str, Any
 
 
 def _session_from(content: Mapping[str, Any], source: str) -> Session:
-    known = {"model", "coils", "alignment", "correspondences", "speaker", "energy"}
+    known = {"model", "coils", "smoothing", "head", "alignment", "palate", "correspondences", "speaker", "energy"}
     for table in content:
         if table not in known:
             raise InputError(f"the table or key '{table}' is unknown; expected {', '.join(sorted(known))}.")
@@ -212,11 +236,14 @@ def _session_from(content: Mapping[str, Any], source: str) -> Session:
         Energy(**{name: _number(value, f"[energy] {name}") for name, value in energy.items()}),
         _text(content.get("model", ""), "model"),
         source,
+        smoothing_from_toml(_table(content, "smoothing")) if "smoothing" in content else NO_SMOOTHING,
+        head_from_toml(_table(content, "head")) if "head" in content else None,
+        palate_from_toml(_table(content, "palate")) if "palate" in content else None,
     )
 
 
 def _alignment(table: Mapping[str, Any]) -> Alignment:
-    _only(table, {"axes", "rotation", "translation_mm", "midsagittal"}, "alignment")
+    _only(table, {"axes", "rotation", "translation_mm", "midsagittal", "source"}, "alignment")
     if "axes" in table and "rotation" in table:
         raise InputError("[alignment] has both 'axes' and 'rotation'; keep one of them.")
     rotation = np.eye(3)
@@ -233,7 +260,7 @@ def _alignment(table: Mapping[str, Any]) -> Alignment:
     midsagittal = table.get("midsagittal", False)
     if not isinstance(midsagittal, bool):
         raise InputError(f"[alignment] midsagittal = {midsagittal!r}: expected true or false.")
-    return Alignment(rotation, translation, midsagittal)
+    return Alignment(rotation, translation, midsagittal, _text(table.get("source", ""), "[alignment] source"))
 
 
 def axis_mapping(axes: Any) -> FloatArray:

@@ -49,7 +49,9 @@ def complete_setup(recording: Recording, model: TongueModel, session: Session) -
         named = ", ".join(f"{channel} = {role}" for channel, role in coil_map.roles.items())
         decisions.append(f"coils ({coil_map.why}): {named}")
     channels, roles = tuple(coil_map.tongue), tuple(coil_map.tongue.values())
-    preparation = Preparation(picked_channels(recording.coils, channels), session.alignment)
+    preparation = preparation_of(
+        recording.coils, channels, roles, replace(session, coils=coil_map.roles), recording.rate_hz
+    )
     decisions.append(
         f"alignment ({'default' if session.source in (NO_SESSION, '--coils') else 'session'}): {session.alignment}"
     )
@@ -67,7 +69,7 @@ def complete_setup(recording: Recording, model: TongueModel, session: Session) -
     if len(stated) == len(roles):
         vertices = tuple(stated[role] for role in roles)
     else:
-        coils = preparation.all_frames(recording.positions)
+        coils = preparation.all_frames(recording.positions, recording.rate_hz)
         found = estimate_correspondences(model, coils, roles, session.energy)
         vertices = tuple(stated.get(role, vertex) for role, vertex in zip(roles, found.vertices, strict=True))
         decisions.append(f"correspondences (estimated): {found}")
@@ -92,6 +94,28 @@ def complete_setup(recording: Recording, model: TongueModel, session: Session) -
         model_fingerprint=model.fingerprint,
     )
     return Setup(channels, roles, vertices, preparation, completed, tuple(decisions))
+
+
+def preparation_of(
+    available: Sequence[str], channels: Sequence[str], roles: Sequence[str], session: Session, rate_hz: float
+) -> Preparation:
+    """What the session says of smoothing, head and alignment, for these channels of a source.
+
+    Raises InputError where a reference coil of [head] is none of the source's.
+    """
+    head, references = session.head, None
+    if head is not None:
+        channel_of = {role: channel for channel, role in session.coils.items()}
+        for role in head.roles:
+            if channel_of.get(role) not in available:
+                raise InputError(
+                    f"{session.source}: [head] has a rest position for {role}, but no channel of the source has that "
+                    "role in [coils]; name it there, or leave the role out of [head]."
+                )
+        references = picked_channels(available, [channel_of[role] for role in head.roles])
+    return Preparation(
+        picked_channels(available, channels), session.alignment, roles, head, references, session.smoothing, rate_hz
+    )
 
 
 def picked_channels(available: Sequence[str], channels: Sequence[str]) -> NDArray[np.int64]:
