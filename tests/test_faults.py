@@ -64,6 +64,16 @@ def test_a_step_that_was_first_seen_across_a_gap_is_learned_all_the_same():
     assert clock.step == 8
 
 
+@pytest.mark.parametrize("jitter_s", [1e-6, 1e-5, 1e-4, 3e-4])
+@pytest.mark.parametrize("counts", [True, False])
+def test_a_clock_that_jitters_has_its_mean_rate_and_no_gaps(jitter_s, counts):
+    jitter = np.random.default_rng(1).normal(scale=jitter_s, size=2000).tolist()
+    frames = [(k * counts, k / 400 + jitter[k]) for k in range(2000)]
+    _, missing, clock = judged(frames)
+    assert missing <= 4  # two at the very start, while nothing is known
+    assert clock.period_s == pytest.approx(0.0025, rel=0.08)
+
+
 def test_numbers_that_stand_still_leave_the_judgement_to_the_time():
     frames = [(0, k * 0.01) for k in range(60)]
     verdicts, missing, clock = judged(frames[:30] + frames[33:])
