@@ -250,6 +250,8 @@ def statuses_in(datagram):
         (["simulate:", "--osc", "nowhere"], "expected HOST:PORT"),
         (["simulate:", "--session", "nothing.toml"], "there is no such session file"),
         (["simulate:", "--control", "127.0.0.1:99999"], "99999"),
+        (["simulate:", "--record", "take.csv"], "a take's name ends in .xdf"),
+        (["simulate:", "--save-session", "."], "this is a folder"),
     ],
 )
 def test_bad_input_is_one_sentence_and_exit_code_2(arguments, words, tmp_path):
@@ -273,3 +275,33 @@ def test_a_take_is_never_overwritten(folder, tmp_path):
     assert code == 2
     assert "never overwritten" in said
     assert (tmp_path / "take.xdf").read_bytes() == b"precious"
+
+
+def test_a_session_that_cannot_be_saved_does_not_take_the_summary_with_it(tmp_path):
+    (tmp_path / "gone").mkdir()
+    process = subprocess.Popen(
+        [
+            *TONGUETRACK,
+            "live",
+            "simulate:",
+            "--seconds",
+            "0.5",
+            "--save-session",
+            "gone/s.toml",
+            "--control",
+            "127.0.0.1:0",
+        ],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("tracking "):
+            (tmp_path / "gone").rmdir()
+            break
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "frames           125 in" in out
+    assert err.strip().splitlines()[-1].startswith("tonguetrack: gone/s.toml: ")

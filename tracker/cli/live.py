@@ -73,7 +73,7 @@ def run_live_command(args: argparse.Namespace) -> int:
     from ... import InputError
     from ..sources import open_source
     from ..streams.osc import resolve
-    from ..takes.keeper import check_place
+    from ..takes.keeper import check_place, is_folder
     from .names import keep_apart, named_model, prepare_folder
     from .track import read_session
     from .watching import stopped_by_signals
@@ -86,8 +86,12 @@ def run_live_command(args: argparse.Namespace) -> int:
     for output in filter(None, (args.save_session, args.record)):
         keep_apart([Path(output)], [Path(args.model)])
         prepare_folder(Path(output))
+    if args.save_session and Path(args.save_session).is_dir():
+        raise InputError(f"--save-session {args.save_session}: this is a folder; name a file.")
     if args.record:
         check_place(args.record)
+        if is_folder(Path(args.record)):
+            prepare_folder(Path(args.record) / "take.xdf")
     say(f"model: {model.name} [{model.fingerprint}]")
     say(f"opening {args.source}")
     source = open_source(args.source)
@@ -104,8 +108,13 @@ def run_live_command(args: argparse.Namespace) -> int:
     if summary is None:
         say("stopped before anything was tracked.")
         return 0
-    print(json.dumps(summary.as_dict(), indent=2, allow_nan=False) if args.json else summary)
+    show(args, summary)
     return 1 if any(take.failure for take in summary.takes) else 0
+
+
+def show(args: argparse.Namespace, summary: Summary) -> None:
+    """The summary, for people or scripts."""
+    print(json.dumps(summary.as_dict(), indent=2, allow_nan=False) if args.json else summary)
 
 
 def run_source(
@@ -161,6 +170,9 @@ def serve_clients(
 
 def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destinations: list[str]) -> Summary:
     """Tracks with everything around it: sinks, takes, controls, the status line."""
+    from pathlib import Path
+
+    from ... import InputError
     from ...drivers.devices.authors_live import AuthorsLive
     from ...drivers.devices.source import DeviceSource
     from ..control import ControlQueue
@@ -168,8 +180,9 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
     from ..live import LiveRun, stream_info
     from ..served import obey_client
     from ..status import LiveStatus
+    from ..streams.addresses import CONTROL_TAKE
     from ..takes.describing import take_info
-    from ..takes.keeper import TakeKeeper
+    from ..takes.keeper import TakeKeeper, is_folder
     from .watching import announced_compilation, say_above, status_line
 
     with announced_compilation():
@@ -186,6 +199,8 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
                 args.record,
                 lambda frame: take_info(source, frame, tracker.model, tracker.setup, tracker.rate_hz),
             )
+            if is_folder(Path(args.record)):
+                say(f"takes go to {args.record}, when asked for: key t or {CONTROL_TAKE} over OSC")
         serve_controls(args.control, controls, stack)
         recording = lambda: keeper is not None and keeper.recorder is not None
         if stack.enter_context(watched_keys(controls, recording)):
@@ -208,8 +223,12 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
         say(f"tracking {', '.join(tracker.setup.roles)} to {', '.join(s.destination for s in status.sinks)}")
         with status_line(status):
             summary = run.run()
-        if args.save_session:
+    if args.save_session:
+        try:
             save_session(args.save_session, tracker)
+        except InputError:  # the folder is gone or full meanwhile: the run itself is not lost with it
+            show(args, summary)
+            raise
     return summary
 
 
@@ -235,9 +254,10 @@ def serve_controls(address: str | None, controls: ControlQueue, stack: ExitStack
     """Listens for control messages. That the usual port is taken stops no run, unless it was asked for."""
     from ... import InputError
     from ..streams.control_osc import DEFAULT_CONTROL, OscControl
+    from .watching import say_above
 
     try:
-        control = stack.enter_context(OscControl(address or DEFAULT_CONTROL, controls))
+        control = stack.enter_context(OscControl(address or DEFAULT_CONTROL, controls, say_above))
     except InputError as reason:
         if address:
             raise
