@@ -235,6 +235,8 @@ def test_every_take_of_any_run_comes_again_bit_for_bit(
         assert take.frame_count == kept.frames
         if kept.frames:
             assert not np.isinf(take.pose).any()
+            poses = take.poses()
+            assert np.isfinite(poses.weights).all() and np.isfinite(poses.speaker_weights).all()
             again = retrack(take, small_model)
             assert again.same, (kept.path, again.differing[:5], take.sessions)
     if whole and source.delivered and not any(isinstance(step, Control) for step in steps):
