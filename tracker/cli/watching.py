@@ -30,7 +30,7 @@ def announced_compilation() -> Iterator[None]:
 
     def announce() -> None:
         _say(
-            "preparing the solver; the first time on this machine it is compiled, which takes some seconds ..."
+            "preparing the solver; the first time on this machine it is compiled, which takes up to half a minute ..."
         )
 
     def misses() -> int:
