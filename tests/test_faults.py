@@ -329,6 +329,48 @@ def test_a_first_connection_that_fails_is_bad_input():
         source_of(InputError("wrong option"))
 
 
+def test_while_a_device_does_not_answer_its_silence_is_told_all_the_same(hurried):
+    answered = threading.Event()
+    scripts = [Script([1, LinkLost("gone")]), Script([2])]
+
+    def connect():
+        if len(scripts) == 1:
+            assert answered.wait(10.0)
+        return scripts.pop(0)
+
+    with DeviceSource(connect, "test:") as source:
+        silent = 0
+        for item in source:
+            if isinstance(item, SourceNote) and item.text == "test: is being connected":
+                silent += 1
+                if silent == 3:
+                    answered.set()
+            if isinstance(item, CoilFrame) and item.frame_number == 2:
+                break
+    assert silent >= 3
+
+
+@pytest.mark.parametrize("answers_first", [True, False])
+def test_a_device_that_answers_when_nobody_wants_it_any_more_is_let_go(hurried, answers_first):
+    answered, second = threading.Event(), Script([])
+    scripts = [Script([1, LinkLost("gone")]), second]
+
+    def connect():
+        if len(scripts) == 1:
+            assert answered.wait(10.0)
+        return scripts.pop(0)
+
+    source = DeviceSource(connect, "test:")
+    next(item for item in source if isinstance(item, SourceNote) and "being connected" in item.text)
+    if answers_first:
+        answered.set()
+        source._attempt.done.wait(10.0)
+    else:
+        threading.Timer(0.05, answered.set).start()
+    source.close()
+    assert second.goodbyes == 1
+
+
 def test_an_input_error_while_reconnecting_is_told_and_tried_again(hurried):
     source = source_of(Script([1, LinkLost("x")]), InputError("the name is not known"), Script([2]))
     assert take(source, 2)[-1] == 2
