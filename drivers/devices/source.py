@@ -79,7 +79,7 @@ class DeviceSource:
         try:
             conversation = connect()
         except LinkLost as reason:
-            raise InputError(f"{address}: {reason}; is the device on, and is this its address?") from reason
+            raise InputError(f"{reason}; is the device on, and is {address} its address?") from reason
         self._conversation: Conversation | None = conversation
         self.coils = conversation.coils
         self.frame = conversation.frame
@@ -132,6 +132,8 @@ class DeviceSource:
                     break
                 if isinstance(item, SourceNote):
                     self._queue.append(item)
+                else:  # for the step and the period that it teaches
+                    self._clock.judge(item.frame_number, item.device_time_s)
         except LinkLost as reason:
             self._queue.append(self._lose(str(reason)))
         self._clock.restart()

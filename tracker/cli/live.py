@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from .demo import positive_seconds
@@ -71,12 +72,14 @@ def run_live_command(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from ... import InputError
+    from ..control import ControlQueue
+    from ..online import compile_kernels
     from ..sources import open_source
     from ..streams.osc import resolve
     from ..takes.keeper import check_place, is_folder
     from .names import keep_apart, named_model, prepare_folder
     from .track import read_session
-    from .watching import stopped_by_signals
+    from .watching import announced_compilation
 
     destinations = args.osc or [DEFAULT_OSC]
     for destination in destinations:
@@ -93,12 +96,36 @@ def run_live_command(args: argparse.Namespace) -> int:
         if is_folder(Path(args.record)):
             prepare_folder(Path(args.record) / "take.xdf")
     say(f"model: {model.name} [{model.fingerprint}]")
-    say(f"opening {args.source}")
-    source = open_source(args.source)
+    with announced_compilation():
+        compile_kernels(model)
+    controls = ControlQueue()
+    with ExitStack() as stack:
+        serve_controls(args.control, controls, stack)
+        say(f"opening {args.source}")
+        job = Job(args, model, session, destinations, controls)
+        return follow(job, open_source(args.source))
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a person asked for, read and checked."""
+
+    args: argparse.Namespace
+    model: TongueModel
+    session: Session
+    destinations: list[str]
+    controls: ControlQueue
+
+
+def follow(job: Job, source: Source) -> int:
+    """Runs on an open source, and closes it whatever happens; the command's exit code."""
+    from ... import InputError
+    from .watching import stopped_by_signals
+
     try:
         with stopped_by_signals(source) as stopped:
             try:
-                summary = run_source(args, source, model, session, destinations)
+                summary = run_source(job, source)
             except InputError:  # a source that was stopped tells too little to begin with
                 if not stopped.is_set():
                     raise
@@ -108,7 +135,7 @@ def run_live_command(args: argparse.Namespace) -> int:
     if summary is None:
         say("stopped before anything was tracked.")
         return 0
-    show(args, summary)
+    show(job.args, summary)
     return 1 if any(take.failure for take in summary.takes) else 0
 
 
@@ -117,65 +144,55 @@ def show(args: argparse.Namespace, summary: Summary) -> None:
     print(json.dumps(summary.as_dict(), indent=2, allow_nan=False) if args.json else summary)
 
 
-def run_source(
-    args: argparse.Namespace, source: Source, model: TongueModel, session: Session, destinations: list[str]
-) -> Summary | None:
+def run_source(job: Job, source: Source) -> Summary | None:
     """One run; where clients drive the source, one after the other until it is stopped."""
     from ...drivers.devices.authors_live import AuthorsLive
     from ..gathering import recording_for_setup
     from ..online import Tracker
-    from ..session import NO_SESSION
     from ..setup import complete_setup
 
     if isinstance(source, AuthorsLive):
-        return serve_clients(
-            args, source, model, session if session.source != NO_SESSION else None, destinations
-        )
-    recording = recording_for_setup(source, session, LISTEN_S, say)
-    setup = complete_setup(recording, model, session)
+        return serve_clients(job, source)
+    recording = recording_for_setup(source, job.session, LISTEN_S, say)
+    setup = complete_setup(recording, job.model, job.session)
     for decision in setup.decisions:
         say(decision)
-    fix_after_s = args.fix_speaker_after if args.speaker == "mean" else None
+    fix_after_s = job.args.fix_speaker_after if job.args.speaker == "mean" else None
     rate_hz = source.rate_hz or recording.rate_hz
-    tracker = Tracker(model, setup, rate_hz, watchful=True, fix_after_s=fix_after_s)
-    return run_once(args, source, tracker, destinations)
+    tracker = Tracker(job.model, setup, rate_hz, watchful=True, fix_after_s=fix_after_s)
+    return run_once(job, source, tracker)
 
 
-def serve_clients(
-    args: argparse.Namespace,
-    source: AuthorsLive,
-    model: TongueModel,
-    session: Session | None,
-    destinations: list[str],
-) -> Summary | None:
+def serve_clients(job: Job, source: AuthorsLive) -> Summary | None:
     """A run for each set of vertices that clients of the authors' server name, until the source is stopped."""
     from ... import InputError
     from ..online import Tracker
     from ..served import next_vertices, setup_for_points
+    from ..session import NO_SESSION
 
     summary = None
+    session = job.session if job.session.source != NO_SESSION else None
     say(f"{source.address}: waiting for a client to name its vertices")
     while source.wait_until_ready():
         try:
-            setup = setup_for_points(model, source.coils, source.vertices, session)
+            setup = setup_for_points(job.model, source.coils, source.vertices, session)
         except InputError as reason:  # one client's mistake is not the end for the others
             say(str(reason))
             next_vertices(source)
             continue
-        summary = run_once(args, source, Tracker(model, setup, source.rate_hz), destinations)
+        summary = run_once(job, source, Tracker(job.model, setup, source.rate_hz))
         if source.vertices == setup.vertices:
             break
     return summary
 
 
-def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destinations: list[str]) -> Summary:
-    """Tracks with everything around it: sinks, takes, controls, the status line."""
+def run_once(job: Job, source: Source, tracker: Tracker) -> Summary:
+    """Tracks with everything around it: sinks, takes, keys, the status line."""
     from pathlib import Path
 
     from ... import InputError
     from ...drivers.devices.authors_live import AuthorsLive
     from ...drivers.devices.source import DeviceSource
-    from ..control import ControlQueue
     from ..keyboard import KEYS, watched_keys
     from ..live import LiveRun, stream_info
     from ..served import obey_client
@@ -189,10 +206,9 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
         tracker.warm_up()
     if isinstance(source, DeviceSource):
         source.catch_up()
-    status = LiveStatus(tracker.setup.roles)
-    controls = ControlQueue()
+    args, status = job.args, LiveStatus(tracker.setup.roles)
     with ExitStack() as stack:
-        status.sinks = tuple(open_sinks(source, destinations, status, stack))
+        status.sinks = tuple(open_sinks(source, job.destinations, status, stack))
         keeper = None
         if args.record:
             keeper = TakeKeeper(
@@ -201,9 +217,8 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
             )
             if is_folder(Path(args.record)):
                 say(f"takes go to {args.record}, when asked for: key t or {CONTROL_TAKE} over OSC")
-        serve_controls(args.control, controls, stack)
         recording = lambda: keeper is not None and keeper.recorder is not None
-        if stack.enter_context(watched_keys(controls, recording)):
+        if stack.enter_context(watched_keys(job.controls, recording)):
             say(f"keys: {KEYS}; Ctrl-C ends")
         run = LiveRun(
             source,
@@ -212,7 +227,7 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
             status,
             status.sinks,
             keeper,
-            controls,
+            job.controls,
             fix_after_s=args.fix_speaker_after,
             seconds=args.seconds,
             said=say_above,

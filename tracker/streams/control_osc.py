@@ -27,9 +27,8 @@ MAX_TOLD = 20
 TICK_S = 0.2
 """How long `close` may have to wait for the thread."""
 
-# A name becomes part of a file's name: nothing that leads to another folder, nothing hidden, only letters that
-# every file system takes.
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9 _.-]*[A-Za-z0-9_-])?")
+# A name becomes part of a file's name: nothing that leads to another folder, nothing hidden.
+_PLAIN_NAME = re.compile(r"\w([\w .-]*[\w-])?")
 _TAKE: dict[int | str, ControlKind] = {
     1: "take_start",
     0: "take_stop",
