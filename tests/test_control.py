@@ -127,7 +127,9 @@ def test_a_takes_name_can_lead_to_no_other_folder(name):
 
 
 def test_a_take_may_be_named_in_any_letters():
-    assert control_of("/tongue/control/take", [1, "Müller 2"], NOW_NS) == Control("take_start", "Müller 2", NOW_NS)
+    assert control_of("/tongue/control/take", [1, "Müller 2"], NOW_NS) == Control(
+        "take_start", "Müller 2", NOW_NS
+    )
 
 
 def test_texts_are_bounded_and_printable():
