@@ -25,7 +25,7 @@ class ReplaySource:
     loop: begin again after the last frame, until closed. Times and frame numbers go on increasing: one
     pass is as long as the recording plus one sampling interval.
     A take's own device times and frame numbers are delivered as they were recorded, jumps and all, unless
-    it loops; the pace is that of the frames' arrival.
+    it loops; the pace is that of its `times_s`.
 
     The first frame is due at once and sets the clock: frame i is due (times_s[i] - times_s[0]) / speed
     after it, so that a slow reader or a late wake-up never shifts the rest. A reader that falls behind

@@ -109,7 +109,8 @@ def test_dropped_frames_are_counted_as_the_devices_numbers_show_them(folder, tmp
     summary, _, take = recorded(folder, tmp_path, "drop=0.05", 2.0)
     missing = int((np.diff(take.recording().frame_numbers) - 1).sum())
     assert missing > 5
-    assert summary["missing_frames"] == missing
+    # What is missing among the first three frames nobody can know: the step is not learned yet.
+    assert missing - 2 <= summary["missing_frames"] <= missing
     assert summary["status_shares"]["ok"] > 0.95
 
 
@@ -128,7 +129,7 @@ def test_damaged_packets_do_not_end_the_run(folder, tmp_path):
 
 
 def test_a_stall_is_told_while_it_lasts_and_loses_nothing(folder, tmp_path):
-    summary, _, take = recorded(folder, tmp_path, "stall=1.2@1", 3.0)
+    summary, _, take = recorded(folder, tmp_path, "stall=1.2@2", 4.5)
     assert (np.diff(take.recording().frame_numbers) == 1).all()
     assert np.diff(take.stamps).max() > 0.8
     assert summary["disconnections"] == 0
@@ -250,6 +251,8 @@ def statuses_in(datagram):
         (["simulate:", "--osc", "nowhere"], "expected HOST:PORT"),
         (["simulate:", "--session", "nothing.toml"], "there is no such session file"),
         (["simulate:", "--control", "127.0.0.1:99999"], "99999"),
+        (["simulate:", "--record", "take.csv"], "a take's name ends in .xdf"),
+        (["simulate:", "--save-session", "."], "this is a folder"),
     ],
 )
 def test_bad_input_is_one_sentence_and_exit_code_2(arguments, words, tmp_path):
@@ -273,3 +276,33 @@ def test_a_take_is_never_overwritten(folder, tmp_path):
     assert code == 2
     assert "never overwritten" in said
     assert (tmp_path / "take.xdf").read_bytes() == b"precious"
+
+
+def test_a_session_that_cannot_be_saved_does_not_take_the_summary_with_it(tmp_path):
+    (tmp_path / "gone").mkdir()
+    process = subprocess.Popen(
+        [
+            *TONGUETRACK,
+            "live",
+            "simulate:",
+            "--seconds",
+            "0.5",
+            "--save-session",
+            "gone/s.toml",
+            "--control",
+            "127.0.0.1:0",
+        ],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("tracking "):
+            (tmp_path / "gone").rmdir()
+            break
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "frames           125 in" in out
+    assert err.strip().splitlines()[-1].startswith("tonguetrack: gone/s.toml: ")

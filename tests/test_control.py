@@ -15,7 +15,7 @@ from pythonosc.osc_message_builder import OscMessageBuilder
 from tonguetrack import InputError
 from tonguetrack.tracker.control import MAX_WAITING, Control, ControlQueue
 from tonguetrack.tracker.streams.addresses import CONTROL_FORMS, MAX_CONTROL_TEXT
-from tonguetrack.tracker.streams.control_osc import OscControl, control_of
+from tonguetrack.tracker.streams.control_osc import MAX_TOLD, OscControl, control_of
 from tonguetrack.tracker.streams.monitor import decode
 
 NOW_NS = 77
@@ -120,10 +120,16 @@ def test_whatever_is_not_in_the_table_asks_for_nothing(path, values):
 
 
 @pytest.mark.parametrize(
-    "name", ["", ".", "..", "../take", "a/b", "a\\b", "/tmp/x", "C:x", ".hidden", "end.", "end ", "nul\0", "Ü", "a\n"]
+    "name", ["", ".", "..", "../take", "a/b", "a\\b", "/tmp/x", "C:x", ".hidden", "end.", "end ", "nul\0", "a\n"]
 )  # fmt: skip
 def test_a_takes_name_can_lead_to_no_other_folder(name):
     assert control_of("/tongue/control/take", [1, name], NOW_NS) is None
+
+
+def test_a_take_may_be_named_in_any_letters():
+    assert control_of("/tongue/control/take", [1, "Müller 2"], NOW_NS) == Control(
+        "take_start", "Müller 2", NOW_NS
+    )
 
 
 def test_texts_are_bounded_and_printable():
@@ -177,6 +183,18 @@ def test_a_datagram_becomes_a_wish_with_the_time_of_its_arrival(listening):
     assert (wish.kind, wish.text) == ("take_start", "vowels")
     assert before_ns < wish.time_ns < time.perf_counter_ns()
     assert (listening.control.accepted, listening.control.refused) == (1, 0)
+
+
+def test_what_was_meant_for_us_and_not_understood_is_told_a_few_times_in_plain_letters():
+    told = []
+    with OscControl("127.0.0.1:0", ControlQueue(), told.append) as control:
+        control._receive(message("/tongue/control/take", 1, "M/\u00fcller").dgram, 0)
+        control._receive(message("/nothing/of/ours", 1).dgram, 0)
+        assert len(told) == 1 and "/tongue/control/take [1, 'M/\\xfcller']" in told[0] and told[0].isascii()
+        for _ in range(2 * MAX_TOLD):
+            control._receive(message("/marker", 7).dgram, 0)
+    assert len(told) == MAX_TOLD
+    assert control.refused == 2 + 2 * MAX_TOLD
 
 
 def test_a_bundle_is_obeyed_message_by_message(listening):

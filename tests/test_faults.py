@@ -64,6 +64,16 @@ def test_a_step_that_was_first_seen_across_a_gap_is_learned_all_the_same():
     assert clock.step == 8
 
 
+@pytest.mark.parametrize("jitter_s", [1e-6, 1e-5, 1e-4, 3e-4])
+@pytest.mark.parametrize("counts", [True, False])
+def test_a_clock_that_jitters_has_its_mean_rate_and_no_gaps(jitter_s, counts):
+    jitter = np.random.default_rng(1).normal(scale=jitter_s, size=2000).tolist()
+    frames = [(k * counts, k / 400 + jitter[k]) for k in range(2000)]
+    _, missing, clock = judged(frames)
+    assert missing <= 4  # two at the very start, while nothing is known
+    assert clock.period_s == pytest.approx(0.0025, rel=0.08)
+
+
 def test_numbers_that_stand_still_leave_the_judgement_to_the_time():
     frames = [(0, k * 0.01) for k in range(60)]
     verdicts, missing, clock = judged(frames[:30] + frames[33:])
@@ -317,6 +327,48 @@ def test_a_first_connection_that_fails_is_bad_input():
         source_of(LinkLost("nobody answers"))
     with pytest.raises(InputError, match="wrong option"):
         source_of(InputError("wrong option"))
+
+
+def test_while_a_device_does_not_answer_its_silence_is_told_all_the_same(hurried):
+    answered = threading.Event()
+    scripts = [Script([1, LinkLost("gone")]), Script([2])]
+
+    def connect():
+        if len(scripts) == 1:
+            assert answered.wait(10.0)
+        return scripts.pop(0)
+
+    with DeviceSource(connect, "test:") as source:
+        silent = 0
+        for item in source:
+            if isinstance(item, SourceNote) and item.text == "test: is being connected":
+                silent += 1
+                if silent == 3:
+                    answered.set()
+            if isinstance(item, CoilFrame) and item.frame_number == 2:
+                break
+    assert silent >= 3
+
+
+@pytest.mark.parametrize("answers_first", [True, False])
+def test_a_device_that_answers_when_nobody_wants_it_any_more_is_let_go(hurried, answers_first):
+    answered, second = threading.Event(), Script([])
+    scripts = [Script([1, LinkLost("gone")]), second]
+
+    def connect():
+        if len(scripts) == 1:
+            assert answered.wait(10.0)
+        return scripts.pop(0)
+
+    source = DeviceSource(connect, "test:")
+    next(item for item in source if isinstance(item, SourceNote) and "being connected" in item.text)
+    if answers_first:
+        answered.set()
+        source._attempt.done.wait(10.0)
+    else:
+        threading.Timer(0.05, answered.set).start()
+    source.close()
+    assert second.goodbyes == 1
 
 
 def test_an_input_error_while_reconnecting_is_told_and_tried_again(hurried):

@@ -413,6 +413,24 @@ def test_the_summary_is_plain_json_without_nan(small_model, take):
         assert str(summary)
 
 
+def test_a_status_line_begins_with_what_matters_and_is_cut_between_its_parts(small_model, take):
+    from tonguetrack.tracker.cli.watching import status_text, whole_parts
+
+    recording, setup = take
+    status = LiveStatus(setup.roles)
+    run(small_model, recording, setup, status=status)
+    status.take_path, status.take_frames = "take.xdf", 400
+    line = status_text(status, 250.0)
+    assert line.startswith("rec 400  250 Hz ok  ")
+    for width in range(20, len(line) + 2):
+        cut = whole_parts(line, width)
+        assert len(cut) <= width and (line + "  ").startswith(cut + "  ")
+    assert whole_parts(line, len(line)) == line
+    assert whole_parts("[one long trouble]", 8) == "[one lon"
+    status.take_failure = "the disk is full"
+    assert status_text(status, 250.0).startswith("[NOT RECORDING: the disk is full] 250 Hz ok")
+
+
 def test_the_status_can_be_read_while_it_is_written(small_model, take):
     from tonguetrack.tracker.cli.watching import status_text
 

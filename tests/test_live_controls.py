@@ -274,6 +274,9 @@ def test_places_that_cannot_be_are_refused_before_anything_is_opened(tmp_path):
         check_place(tmp_path / "there.xdf")
     with pytest.raises(InputError, match="this is a file"):
         check_place(tmp_path / "file")
+    with pytest.raises(InputError, match="ends in .xdf"):
+        check_place(tmp_path / "take.csv")
+    check_place(tmp_path / "2026-11.22")
 
 
 # Clients --------------------------------------------------------------------------------------------

@@ -76,7 +76,8 @@ DOCS = {
     ".venv/bin/tonguetrack take export first.xdf --what poses -o poses.csv": HERE,
     ".venv/bin/tonguetrack take export first.xdf --what session -o first.toml": HERE,
     '.venv/bin/tonguetrack live "replay:first.xdf?speed=max" --session first.toml': HERE,
-    ".venv/bin/tonguetrack take recover first.xdf -o whole.xdf": ELSEWHERE + "test_cli_take.py: a whole take is refused",
+    ".venv/bin/tonguetrack take recover first.xdf -o whole.xdf": ELSEWHERE
+    + "test_cli_take.py: a whole take is refused",
     "TONGUETRACK_FUZZ=nightly .venv/bin/pytest tests/test_fuzz.py": "by hand, before a release",
     ".venv/bin/tonguetrack info recordings/demo.csv": HERE,
     ".venv/bin/tonguetrack track recordings/demo.csv --out poses.csv --save-session session.toml": HERE,

@@ -1,5 +1,6 @@
 """Whatever happens in a run, each of its takes gives the same bits again: random scripts of frames and troubles."""
 
+import math
 import time
 from dataclasses import dataclass, replace
 
@@ -13,6 +14,7 @@ from tonguetrack.tracker.bench import made_up_recording
 from tonguetrack.tracker.control import Control, ControlQueue
 from tonguetrack.tracker.live import LiveRun, stream_info
 from tonguetrack.tracker.online import Tracker
+from tonguetrack.tracker.served import obey_client, setup_for_points
 from tonguetrack.tracker.status import LiveStatus
 from tonguetrack.tracker.takes.describing import take_info
 from tonguetrack.tracker.takes.keeper import TakeKeeper
@@ -49,6 +51,14 @@ class Estimate:
     sigma: float
 
 
+@dataclass(frozen=True)
+class Command:
+    """What a client of the authors' server asks for, where one drives the run."""
+
+    name: str
+    values: tuple[float, ...] = ()
+
+
 WAYS = ("missing", "wild", "off", "still", "huge", "outlier")
 COILS = st.lists(st.integers(0, 4), min_size=1, max_size=5, unique=True).map(tuple)
 COUNTS = st.integers(1, 90)
@@ -64,6 +74,12 @@ STEPS = st.one_of(
         st.sampled_from(["fix_speaker", "free_speaker", "take_start", "take_stop"]),
     ),
     st.builds(Control, st.just("mark"), st.sampled_from(["vowels", "session: no", "source: mine", "ə\n"])),
+    st.sampled_from([Command("fix_speaker"), Command("reset"), Command("unheard of")]),
+    st.builds(
+        Command,
+        st.just("set_settings"),
+        st.tuples(*[st.sampled_from([math.nan, -1.0, 0.0, 0.3, 1.0, 40.0, math.inf])] * 3),
+    ),
     st.just("wait"),
 )
 SCRIPTS = st.lists(STEPS, min_size=1, max_size=14)
@@ -98,6 +114,10 @@ class Played:
                 self._estimates.give(step.sigma)
             elif isinstance(step, NoteKind):
                 yield SourceNote(step, step.value, self._arrival_ns, 1)
+            elif isinstance(step, Command):
+                yield SourceNote(
+                    NoteKind.COMMAND, "", self._arrival_ns, command=step.name, values=step.values
+                )
             elif isinstance(step, Control):
                 self._controls.put(replace(step, time_ns=self._arrival_ns))
             else:
@@ -178,16 +198,19 @@ def recordings(small_model):
     joint=st.booleans(),
     fix_after_s=st.sampled_from([None, 0.05, 0.3]),
     whole=st.booleans(),
+    served=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
 )
 def test_every_take_of_any_run_comes_again_bit_for_bit(
-    small_model, recordings, tmp_path_factory, steps, rate_hz, free, joint, fix_after_s, whole, seed
+    small_model, recordings, tmp_path_factory, steps, rate_hz, free, joint, fix_after_s, whole, served, seed
 ):
     recording, setup = recordings[rate_hz]
+    if served:
+        setup = setup_for_points(small_model, recording.coils, setup.vertices, setup.session)
     if free:
         setup = replace(setup, session=replace(setup.session, speaker_weights=None))
     folder = tmp_path_factory.mktemp("takes")
-    tracker = Tracker(small_model, setup, rate_hz, watchful=True, fix_after_s=fix_after_s)
+    tracker = Tracker(small_model, setup, rate_hz, watchful=not served, fix_after_s=fix_after_s)
     controls, estimates = ControlQueue(), Estimates(small_model.speaker)
     source = Played(recording, steps, rate_hz, controls, lambda: keeper.wait(), seed, estimates)
     keeper = TakeKeeper(
@@ -203,6 +226,7 @@ def test_every_take_of_any_run_comes_again_bit_for_bit(
         controls=controls,
         background=estimates if joint else None,
         fix_after_s=fix_after_s or 0.2,
+        handles=obey_client if served else None,
     ).run()
     assert summary.frames == source.delivered
     for kept in summary.takes:
@@ -211,6 +235,8 @@ def test_every_take_of_any_run_comes_again_bit_for_bit(
         assert take.frame_count == kept.frames
         if kept.frames:
             assert not np.isinf(take.pose).any()
+            poses = take.poses()
+            assert np.isfinite(poses.weights).all() and np.isfinite(poses.speaker_weights).all()
             again = retrack(take, small_model)
             assert again.same, (kept.path, again.differing[:5], take.sessions)
     if whole and source.delivered and not any(isinstance(step, Control) for step in steps):

@@ -828,6 +828,14 @@ def test_options_of_files_are_refused_for_a_synthetic_speaker(capsys):
     assert "--file-rate goes with --from" in capsys.readouterr().err
 
 
+def test_a_file_that_needs_to_be_told_more_is_told_how_here(tmp_path, capsys):
+    from tonguetrack.tracker.cli import main
+
+    (tmp_path / "a.csv").write_text("tip_x,tip_y,tip_z\n" + "1,2,3\n" * 20, encoding="utf-8")
+    assert main(["simulate", "device", "rtc3d", "--from", str(tmp_path / "a.csv"), "--rate", "100"]) == 2
+    assert "pass it with --file-unit" in capsys.readouterr().err
+
+
 def test_a_port_that_is_taken_is_refused_in_a_sentence(played, capsys):
     from tonguetrack.tracker.cli import main
 

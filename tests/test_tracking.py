@@ -12,10 +12,10 @@ from tonguetrack.drivers import open_recording
 from tonguetrack.drivers.frames import CoilFrame, Recording
 from tonguetrack.model.build import load_training_shapes, model_from_shapes, read_sample_database
 from tonguetrack.model.files import load_model
+from tonguetrack.tracker.online import Tracker
 from tonguetrack.tracker.pose import PoseStatus
 from tonguetrack.tracker.posefiles import write_poses
 from tonguetrack.tracker.session import Alignment, Session
-from tonguetrack.tracker.online import Tracker
 from tonguetrack.tracker.tracking import track_recording
 
 VERTICES = {"tongue_tip": 3, "tongue_blade": 9, "tongue_dorsum": 15}

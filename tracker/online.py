@@ -15,6 +15,8 @@ from ..drivers.frames import CoilFrame
 from ..model.multilinear import TongueModel
 from .guard import CoilGuard
 from .pose import CoilState, FloatArray, PoseStatus, TrackedPose
+from .preparation import Preparation
+from .session import Session
 from .setup import Setup
 from .solver import FixedSpeakerSolver, FreeSpeakerSolver
 from .tracking import fixed_speaker_energy
@@ -276,3 +278,10 @@ class Tracker:
             coil_states=np.full(len(setup.vertices), CoilState.MISSING, np.int64),
         )
         self.changes += 1
+
+
+def compile_kernels(model: TongueModel) -> None:
+    """Compiles or loads what frames will need, on three vertices of the model, before anything waits for them."""
+    names, session = ("a", "b", "c"), Session()
+    setup = Setup(names, names, (0, 1, 2), Preparation(np.arange(3), session.alignment), session, ())
+    Tracker(model, setup, watchful=True).warm_up()

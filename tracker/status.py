@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 Percentiles = dict[str, float | int | None]
 
+MISPLACED_MM = 5.0
+"""A mean residual above this has no tongue that lies where the model is."""
+JUDGED_FRAMES = 50
 DEVICE_DRIFT = 1e-4
 """A device's clock runs at most so much faster or slower than the host's."""
 
@@ -61,7 +64,8 @@ class LiveStatus:
     device_to_host_ns: what `DeviceDelay` says; host_to_solved_ns, solved_to_sent_ns, arrival_to_sent_ns: on this
     host's clock; solve_ns: one tracker step.
     coils_missing, coils_distrusted: (n,) frames in which each coil was absent, or there and did not count.
-    coil_states: (n,) of the latest frame. silent_s: how long the source has been silent, 0.0 = it is not.
+    coil_states: (n,) of the latest frame. silent_s: how long the source has been silent, 0.0 = it is not; away_s:
+    all such silences before it together.
     """
 
     def __init__(self, roles: Sequence[str], sinks: Sequence[Sink] = ()) -> None:
@@ -79,7 +83,7 @@ class LiveStatus:
         self.clock_resets = 0
         self.disconnections = 0
         self.bad_data = 0
-        self.silent_s = 0.0
+        self.silent_s = self.away_s = 0.0
         self.connected = True
         self.last_note = ""
         self.solve_ns = latency_histogram()
@@ -102,13 +106,15 @@ class LiveStatus:
         if self.frames == 0:
             self.first_arrival_ns = pose.arrival_ns
             self.first_device_s = pose.device_time_s
-        self.last_arrival_ns = pose.arrival_ns
         self.last_device_s = pose.device_time_s
         self.statuses[pose.status] += 1
         self.status = pose.status
         self.valid_coils = pose.valid_coils
         self.residual_mm = pose.residual_mm
-        self.silent_s = 0.0
+        if self.silent_s > 0.0:
+            self.away_s += (pose.arrival_ns - self.last_arrival_ns) * 1e-9
+            self.silent_s = 0.0
+        self.last_arrival_ns = pose.arrival_ns
         self.connected = True
         if pose.valid_coils:
             self.residuals.add(pose.residual_mm)
@@ -164,6 +170,12 @@ class LiveStatus:
         )
 
     @property
+    def misplaced(self) -> bool:
+        """Whether the residuals are such as only data have that are not in the model's frame."""
+        mean = self.residuals.mean
+        return self.frames >= JUDGED_FRAMES and mean is not None and bool(mean > MISPLACED_MM)
+
+    @property
     def troubles(self) -> list[str]:
         """What a person should know now: coils that do not count and why, a silent source, a take that fails."""
         states = [
@@ -171,6 +183,8 @@ class LiveStatus:
             for role, state in zip(self.roles, self.coil_states, strict=True)
             if state != CoilState.TRUSTED
         ]
+        if self.misplaced:
+            states.append(f"coils {self.residuals.mean:.0f} mm from the model: see [alignment]")
         if self.silent_s > 0.0:
             why = "silent" if self.connected else "disconnected"
             states = [f"source {why} for {self.silent_s:.0f} s"]
@@ -194,6 +208,7 @@ class Summary:
     arrival_to_sent_ms: from the frame's arrival until every sink had it, of which host_to_solved_ms and
     solved_to_sent_ms are the parts; device_to_host_ms: how much later than the fastest frame the others arrived;
     lateness_ms: how late a paced replay handed the frames over, which is before their arrival.
+    away_s: how long the source was silent in all; misplaced: whether the coils are not in the model's frame.
     coils: share of frames with each coil; distrusted: share of frames in which it was there but did not count.
     """
 
@@ -218,7 +233,9 @@ class Summary:
     missing_frames: int
     clock_resets: int
     disconnections: int
+    away_s: float
     bad_data: int
+    misplaced: bool
     sinks: tuple[SinkSummary, ...]
     takes: tuple[KeptTake, ...] = ()
 
@@ -264,8 +281,16 @@ class Summary:
             "disconnections": self.disconnections,
             "damaged pieces": self.bad_data,
         }
-        if any(troubles.values()):
-            lines.append(f"source troubles  {', '.join(f'{n} {what}' for what, n in troubles.items() if n)}")
+        told = [f"{n} {what}" for what, n in troubles.items() if n]
+        if self.away_s > 0.0:
+            told.append(f"{self.away_s:.1f} s without frames")
+        if told:
+            lines.append(f"source troubles  {', '.join(told)}")
+        if self.misplaced:
+            lines.append(
+                "warning          residuals of this size mean that the coils are not in the model's frame; see "
+                "[alignment] in docs/session.md"
+            )
         for sink in self.sinks:
             lines.append(f"sent             {sink.sent} to {sink.destination}, {sink.dropped} dropped")
         for take in self.takes:
@@ -321,7 +346,9 @@ def summarise(
         missing_frames=status.missing_frames,
         clock_resets=status.clock_resets,
         disconnections=status.disconnections,
+        away_s=status.away_s + status.silent_s,
         bad_data=status.bad_data,
+        misplaced=status.misplaced,
         sinks=tuple(SinkSummary(sink.destination, sink.sent, sink.dropped) for sink in status.sinks),
         takes=tuple(takes),
     )

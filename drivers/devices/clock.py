@@ -14,6 +14,7 @@ RESET_APART_S = 0.5
 LONGEST_GAP_S = 60.0
 LEARN_FROM = 48  # the latest differences decide what the step is
 SURE_AFTER = 3
+COMMON = 6  # a step that fewer than one in so many have is no common one
 
 
 class Verdict(Enum):
@@ -94,10 +95,13 @@ class FrameClock:
 
 
 def _learned(steps: deque[float], step: float, before: float) -> float:
-    """The commonest of the latest steps, the smaller one where two are equally common."""
+    """The commonest of the latest steps, the smaller one where two are equally common; where hardly two are equal,
+    as those of a clock that jitters, the one in the middle."""
     steps.append(step)
     if len(steps) < SURE_AFTER or step == before:  # one more of the commonest changes nothing
         return before
     counts = Counter(steps)
     most = max(counts.values())
+    if most * COMMON < len(steps):
+        return sorted(steps)[len(steps) // 2]
     return min(value for value, count in counts.items() if count == most)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -21,6 +22,8 @@ CATCH_UP_S = 1.0
 """A device that sends as fast as it is read is not waited for any longer."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0
 """Pauses between attempts to connect: doubled each time up to the longest."""
+ABANDON_S = 5.0
+"""So long `close` waits for an attempt to connect that is under way."""
 
 
 class Conversation(Protocol):
@@ -76,7 +79,7 @@ class DeviceSource:
         try:
             conversation = connect()
         except LinkLost as reason:
-            raise InputError(f"{address}: {reason}; is the device on, and is this its address?") from reason
+            raise InputError(f"{reason}; is the device on, and is {address} its address?") from reason
         self._conversation: Conversation | None = conversation
         self.coils = conversation.coils
         self.frame = conversation.frame
@@ -84,6 +87,7 @@ class DeviceSource:
         self._heard_s = time.perf_counter()
         self._pause_s = FIRST_PAUSE_S
         self._try_at_s = 0.0
+        self._attempt: _Attempt | None = None
 
     @property
     def rate_hz(self) -> float:
@@ -110,6 +114,9 @@ class DeviceSource:
     def close(self) -> None:
         """Stops the device and lets it go. Not for a signal handler: it may wait for the device."""
         self._stopped = True
+        attempt, self._attempt = self._attempt, None
+        if attempt is not None:
+            attempt.abandon()
         conversation, self._conversation = self._conversation, None
         if conversation is not None:
             conversation.goodbye()
@@ -125,6 +132,8 @@ class DeviceSource:
                     break
                 if isinstance(item, SourceNote):
                     self._queue.append(item)
+                else:  # for the step and the period that it teaches
+                    self._clock.judge(item.frame_number, item.device_time_s)
         except LinkLost as reason:
             self._queue.append(self._lose(str(reason)))
         self._clock.restart()
@@ -177,12 +186,17 @@ class DeviceSource:
         return self._note(NoteKind.DISCONNECTED, why)
 
     def _reconnect(self) -> SourceNote:
-        wait_s = self._try_at_s - time.perf_counter()
-        if wait_s > 0:
-            time.sleep(min(wait_s, TICK_S))
-            return self._note(NoteKind.SILENT, f"{self.address} is not connected")
+        if self._attempt is None:
+            wait_s = self._try_at_s - time.perf_counter()
+            if wait_s > 0:
+                time.sleep(min(wait_s, TICK_S))
+                return self._note(NoteKind.SILENT, f"{self.address} is not connected")
+            self._attempt = _Attempt(self._connect)
+        if not self._attempt.done.wait(TICK_S):
+            return self._note(NoteKind.SILENT, f"{self.address} is being connected")
+        attempt, self._attempt = self._attempt, None
         try:
-            conversation = self._connect()
+            conversation = attempt.result()
         except (LinkLost, InputError) as reason:
             self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
             self._try_at_s = time.perf_counter() + self._pause_s
@@ -204,3 +218,48 @@ class DeviceSource:
 
     def _note(self, kind: NoteKind, text: str, count: int = 0) -> SourceNote:
         return SourceNote(kind, text, time.perf_counter_ns(), count)
+
+
+class _Attempt:
+    """One attempt to connect, in a thread of its own: a device that does not answer costs seconds.
+
+    done: set once `result` has something to give or to raise.
+    """
+
+    def __init__(self, connect: Connect) -> None:
+        self.done = threading.Event()
+        self._connect = connect
+        self._ending = threading.Lock()
+        self._abandoned = False
+        self._conversation: Conversation | None = None
+        self._reason: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="connecting", daemon=True)
+        self._thread.start()
+
+    def result(self) -> Conversation:
+        """The conversation; raises what `connect` raised."""
+        if self._conversation is None:
+            assert self._reason is not None
+            raise self._reason
+        return self._conversation
+
+    def abandon(self) -> None:
+        """Lets the device go, now or when the attempt has ended; waits for that, but not for ever."""
+        with self._ending:
+            self._abandoned = True
+            done = self.done.is_set()
+        if not done:
+            self._thread.join(ABANDON_S)
+        elif self._conversation is not None:
+            self._conversation.goodbye()
+
+    def _run(self) -> None:
+        try:
+            self._conversation = self._connect()
+        except BaseException as reason:  # noqa: BLE001 - raised again where the result is asked for
+            self._reason = reason
+        with self._ending:
+            self.done.set()
+            abandoned = self._abandoned
+        if abandoned and self._conversation is not None:
+            self._conversation.goodbye()

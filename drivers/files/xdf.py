@@ -26,6 +26,8 @@ from .common import UNITS_MM, Options, check_rate, clean, coverage_notes, even_t
 TAKE_MARK, TAKE_VERSION = "tonguetrack_take", "1"
 RAW = "raw"
 LARGEST_STATUS = 0xFFFFFFFF
+CLOCKS_APART_S, CLOCKS_APART = 1.0, 0.01
+"""So much a device's clock and the host's may differ over a take, with its share of the take's length."""
 LONGEST_TAKE_S = 1e7
 """A time stamp farther from the first one is damaged."""
 _EXACT = 2.0**53  # whole numbers up to here are the same as float64
@@ -127,7 +129,7 @@ def take_recording(
     frames, coils = len(stamps), len(head.coils)
     clock, places, *rest = (columns(range(begin, end)) for begin, end in pairwise(begins))
     positions = places.reshape(frames, coils, 3)
-    times, rate_hz, notes = take_times(stamps, head.rate_hz, name, asked_hz)
+    times, rate_hz, notes = take_times(stamps, clock[:, 0], head.rate_hz, name, asked_hz)
     return Recording(
         coils=head.coils,
         positions=positions,
@@ -158,14 +160,17 @@ def _whole_numbers(values: FloatArray) -> np.ndarray:
 
 
 def take_times(
-    stamps: FloatArray, nominal_hz: float, name: str, asked_hz: float | None = None
+    stamps: FloatArray, device_times: FloatArray, nominal_hz: float, name: str, asked_hz: float | None = None
 ) -> tuple[FloatArray, float, list[str]]:
-    """Of a take's frames: s since the first one's arrival, strictly increasing, the rate in Hz, and notes.
+    """Of a take's frames: s since the first one, strictly increasing, the rate in Hz, and notes.
 
-    stamps: (frames,) arrivals, s. nominal_hz: 0.0 = unknown; asked_hz: the user's --rate.
-    Raises InputError where nothing tells the rate.
+    stamps: (frames,) arrivals, s; device_times: (frames,) the device's own clock, s, which is taken where it
+    always goes on and agrees with the arrivals: frames arrive in bursts, but are not measured so.
+    nominal_hz: 0.0 = unknown; asked_hz: the user's --rate. Raises InputError where nothing tells the rate.
     """
     usual_hz = asked_hz or nominal_hz
+    if usual_hz and _goes_on_with(device_times, stamps):
+        return device_times - device_times[0], check_rate(usual_hz, name), []
     with np.errstate(all="ignore"):
         times = stamps - stamps[0]
     if not (np.abs(times) < LONGEST_TAKE_S).all():
@@ -187,6 +192,17 @@ def take_times(
         usual_hz = (len(times) - 1) / float(times[-1])
         notes.append(f"The device stated no sampling rate; {usual_hz:.4g} Hz is the mean of the arrivals.")
     return times, check_rate(usual_hz, name), notes
+
+
+def _goes_on_with(device_times: FloatArray, stamps: FloatArray) -> bool:
+    """Whether the device's clock increases from frame to frame and covers the same time as the arrivals."""
+    if len(stamps) < 2:
+        return False
+    with np.errstate(all="ignore"):
+        steps, span_s = np.diff(device_times), float(stamps[-1] - stamps[0])
+        apart_s = abs(float(device_times[-1] - device_times[0]) - span_s)
+        together = span_s < LONGEST_TAKE_S and apart_s <= CLOCKS_APART_S + CLOCKS_APART * span_s
+        return bool(together and (steps > 0).all())
 
 
 def _increasing(times: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from .demo import positive_seconds
@@ -71,12 +72,14 @@ def run_live_command(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from ... import InputError
+    from ..control import ControlQueue
+    from ..online import compile_kernels
     from ..sources import open_source
     from ..streams.osc import resolve
-    from ..takes.keeper import check_place
+    from ..takes.keeper import check_place, is_folder
     from .names import keep_apart, named_model, prepare_folder
     from .track import read_session
-    from .watching import stopped_by_signals
+    from .watching import announced_compilation
 
     destinations = args.osc or [DEFAULT_OSC]
     for destination in destinations:
@@ -86,15 +89,43 @@ def run_live_command(args: argparse.Namespace) -> int:
     for output in filter(None, (args.save_session, args.record)):
         keep_apart([Path(output)], [Path(args.model)])
         prepare_folder(Path(output))
+    if args.save_session and Path(args.save_session).is_dir():
+        raise InputError(f"--save-session {args.save_session}: this is a folder; name a file.")
     if args.record:
         check_place(args.record)
+        if is_folder(Path(args.record)):
+            prepare_folder(Path(args.record) / "take.xdf")
     say(f"model: {model.name} [{model.fingerprint}]")
-    say(f"opening {args.source}")
-    source = open_source(args.source)
+    with announced_compilation():
+        compile_kernels(model)
+    controls = ControlQueue()
+    with ExitStack() as stack:
+        serve_controls(args.control, controls, stack)
+        say(f"opening {args.source}")
+        job = Job(args, model, session, destinations, controls)
+        return follow(job, open_source(args.source))
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a person asked for, read and checked."""
+
+    args: argparse.Namespace
+    model: TongueModel
+    session: Session
+    destinations: list[str]
+    controls: ControlQueue
+
+
+def follow(job: Job, source: Source) -> int:
+    """Runs on an open source, and closes it whatever happens; the command's exit code."""
+    from ... import InputError
+    from .watching import stopped_by_signals
+
     try:
         with stopped_by_signals(source) as stopped:
             try:
-                summary = run_source(args, source, model, session, destinations)
+                summary = run_source(job, source)
             except InputError:  # a source that was stopped tells too little to begin with
                 if not stopped.is_set():
                     raise
@@ -104,91 +135,90 @@ def run_live_command(args: argparse.Namespace) -> int:
     if summary is None:
         say("stopped before anything was tracked.")
         return 0
-    print(json.dumps(summary.as_dict(), indent=2, allow_nan=False) if args.json else summary)
+    show(job.args, summary)
     return 1 if any(take.failure for take in summary.takes) else 0
 
 
-def run_source(
-    args: argparse.Namespace, source: Source, model: TongueModel, session: Session, destinations: list[str]
-) -> Summary | None:
+def show(args: argparse.Namespace, summary: Summary) -> None:
+    """The summary, for people or scripts."""
+    print(json.dumps(summary.as_dict(), indent=2, allow_nan=False) if args.json else summary)
+
+
+def run_source(job: Job, source: Source) -> Summary | None:
     """One run; where clients drive the source, one after the other until it is stopped."""
     from ...drivers.devices.authors_live import AuthorsLive
     from ..gathering import recording_for_setup
     from ..online import Tracker
-    from ..session import NO_SESSION
     from ..setup import complete_setup
 
     if isinstance(source, AuthorsLive):
-        return serve_clients(
-            args, source, model, session if session.source != NO_SESSION else None, destinations
-        )
-    recording = recording_for_setup(source, session, LISTEN_S, say)
-    setup = complete_setup(recording, model, session)
+        return serve_clients(job, source)
+    recording = recording_for_setup(source, job.session, LISTEN_S, say)
+    setup = complete_setup(recording, job.model, job.session)
     for decision in setup.decisions:
         say(decision)
-    fix_after_s = args.fix_speaker_after if args.speaker == "mean" else None
+    fix_after_s = job.args.fix_speaker_after if job.args.speaker == "mean" else None
     rate_hz = source.rate_hz or recording.rate_hz
-    tracker = Tracker(model, setup, rate_hz, watchful=True, fix_after_s=fix_after_s)
-    return run_once(args, source, tracker, destinations)
+    tracker = Tracker(job.model, setup, rate_hz, watchful=True, fix_after_s=fix_after_s)
+    return run_once(job, source, tracker)
 
 
-def serve_clients(
-    args: argparse.Namespace,
-    source: AuthorsLive,
-    model: TongueModel,
-    session: Session | None,
-    destinations: list[str],
-) -> Summary | None:
+def serve_clients(job: Job, source: AuthorsLive) -> Summary | None:
     """A run for each set of vertices that clients of the authors' server name, until the source is stopped."""
     from ... import InputError
     from ..online import Tracker
     from ..served import next_vertices, setup_for_points
+    from ..session import NO_SESSION
 
     summary = None
+    session = job.session if job.session.source != NO_SESSION else None
     say(f"{source.address}: waiting for a client to name its vertices")
     while source.wait_until_ready():
         try:
-            setup = setup_for_points(model, source.coils, source.vertices, session)
+            setup = setup_for_points(job.model, source.coils, source.vertices, session)
         except InputError as reason:  # one client's mistake is not the end for the others
             say(str(reason))
             next_vertices(source)
             continue
-        summary = run_once(args, source, Tracker(model, setup, source.rate_hz), destinations)
+        summary = run_once(job, source, Tracker(job.model, setup, source.rate_hz))
         if source.vertices == setup.vertices:
             break
     return summary
 
 
-def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destinations: list[str]) -> Summary:
-    """Tracks with everything around it: sinks, takes, controls, the status line."""
+def run_once(job: Job, source: Source, tracker: Tracker) -> Summary:
+    """Tracks with everything around it: sinks, takes, keys, the status line."""
+    from pathlib import Path
+
+    from ... import InputError
     from ...drivers.devices.authors_live import AuthorsLive
     from ...drivers.devices.source import DeviceSource
-    from ..control import ControlQueue
     from ..keyboard import KEYS, watched_keys
     from ..live import LiveRun, stream_info
     from ..served import obey_client
     from ..status import LiveStatus
+    from ..streams.addresses import CONTROL_TAKE
     from ..takes.describing import take_info
-    from ..takes.keeper import TakeKeeper
+    from ..takes.keeper import TakeKeeper, is_folder
     from .watching import announced_compilation, say_above, status_line
 
     with announced_compilation():
         tracker.warm_up()
     if isinstance(source, DeviceSource):
         source.catch_up()
-    status = LiveStatus(tracker.setup.roles)
-    controls = ControlQueue()
+    args, status = job.args, LiveStatus(tracker.setup.roles)
     with ExitStack() as stack:
-        status.sinks = tuple(open_sinks(source, destinations, status, stack))
+        status.sinks = tuple(open_sinks(source, job.destinations, status, stack))
         keeper = None
         if args.record:
             keeper = TakeKeeper(
                 args.record,
                 lambda frame: take_info(source, frame, tracker.model, tracker.setup, tracker.rate_hz),
             )
-        serve_controls(args.control, controls, stack)
+            if is_folder(Path(args.record)):
+                say(f"takes go to {args.record}, when asked for: key t or {CONTROL_TAKE} over OSC")
         recording = lambda: keeper is not None and keeper.recorder is not None
-        if stack.enter_context(watched_keys(controls, recording)):
+        if stack.enter_context(watched_keys(job.controls, recording)):
             say(f"keys: {KEYS}; Ctrl-C ends")
         run = LiveRun(
             source,
@@ -197,7 +227,7 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
             status,
             status.sinks,
             keeper,
-            controls,
+            job.controls,
             fix_after_s=args.fix_speaker_after,
             seconds=args.seconds,
             said=say_above,
@@ -208,8 +238,12 @@ def run_once(args: argparse.Namespace, source: Source, tracker: Tracker, destina
         say(f"tracking {', '.join(tracker.setup.roles)} to {', '.join(s.destination for s in status.sinks)}")
         with status_line(status):
             summary = run.run()
-        if args.save_session:
+    if args.save_session:
+        try:
             save_session(args.save_session, tracker)
+        except InputError:  # the folder is gone or full meanwhile: the run itself is not lost with it
+            show(args, summary)
+            raise
     return summary
 
 
@@ -235,9 +269,10 @@ def serve_controls(address: str | None, controls: ControlQueue, stack: ExitStack
     """Listens for control messages. That the usual port is taken stops no run, unless it was asked for."""
     from ... import InputError
     from ..streams.control_osc import DEFAULT_CONTROL, OscControl
+    from .watching import say_above
 
     try:
-        control = stack.enter_context(OscControl(address or DEFAULT_CONTROL, controls))
+        control = stack.enter_context(OscControl(address or DEFAULT_CONTROL, controls, say_above))
     except InputError as reason:
         if address:
             raise

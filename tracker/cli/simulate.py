@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import signal
 import sys
 from dataclasses import dataclass, replace
@@ -237,9 +238,12 @@ def _check_device(args: argparse.Namespace) -> None:
 def _opened(args: argparse.Namespace) -> Recording:
     from ...drivers import open_recording
 
-    recording = open_recording(
-        args.recording, rate_hz=args.file_rate, unit=args.file_unit, layout=args.file_layout
-    )
+    try:
+        recording = open_recording(
+            args.recording, rate_hz=args.file_rate, unit=args.file_unit, layout=args.file_layout
+        )
+    except InputError as reason:  # --rate is the device's here
+        raise InputError(re.sub(r"--(rate|unit|layout)\b", r"--file-\1", str(reason))) from reason
     if recording.frame_count == 0:
         raise InputError(f"{args.recording}: no frames to play.")
     return recording

@@ -293,6 +293,8 @@ def _figures(poses: TrackedPoses, box: float, model: TongueModel) -> dict[str, A
 
 
 def _print_report(report: dict[str, Any]) -> None:
+    from ..status import MISPLACED_MM
+
     out = sys.stderr
     print(
         f"{report['recording']}: {report['format']}, {report['frames']} frames, {report['rate_hz']:g} Hz",
@@ -314,7 +316,7 @@ def _print_report(report: dict[str, Any]) -> None:
             "frames at the box",
             file=out,
         )
-        if figures["residual_mean_mm"] > 5.0:
+        if figures["residual_mean_mm"] > MISPLACED_MM:
             print(
                 "  warning: residuals of this size mean that the recording is not in the model's frame; "
                 "see [alignment] in docs/session.md",

@@ -20,7 +20,7 @@ from ..status import LiveStatus
 TERMINAL_PERIOD_S = 0.2
 PLAIN_PERIOD_S = 5.0
 COMPILING_AFTER_S = 1.0
-LEGEND = "rate, status, solve p50/p99, arrival to sent p50/p99, residual, coils valid, frames dropped:"
+LEGEND = "rate, status, residual, coils valid, frames dropped, solve p50/p99, arrival to sent p50/p99:"
 
 
 @contextmanager
@@ -30,7 +30,7 @@ def announced_compilation() -> Iterator[None]:
 
     def announce() -> None:
         _say(
-            "preparing the solver; the first time on this machine it is compiled, which takes some seconds ..."
+            "preparing the solver; the first time on this machine it is compiled, which takes up to half a minute ..."
         )
 
     def misses() -> int:
@@ -118,7 +118,7 @@ def _show(status: LiveStatus, over: threading.Event) -> None:
             frames, then = status.frames, now
             if terminal:
                 width = shutil.get_terminal_size().columns - 1
-                sys.stderr.write(f"\r{line[:width]:<{width}}")
+                sys.stderr.write(f"\r{whole_parts(line, width):<{width}}")
                 sys.stderr.flush()
             else:
                 _say(line)
@@ -130,20 +130,29 @@ def _show(status: LiveStatus, over: threading.Event) -> None:
 
 
 def status_text(status: LiveStatus, rate_hz: float) -> str:
-    """One line as `LEGEND` says, short enough for a terminal of 80 columns; what is wrong comes first."""
+    """One line as `LEGEND` says; what is wrong comes first, then how many frames the take has."""
     state = PoseStatus(status.status).name.lower()
     residual = f"{status.residual_mm:.2f}" if status.valid_coils else "-"
     troubles = status.troubles
     wrong = f"[{', '.join(troubles)}] " if troubles else ""
     return (
-        f"{wrong}{rate_hz:.0f} Hz {state}  solve {_pair(status.solve_ns, NS_PER_US, 0)} us  "
-        f"sent {_pair(status.arrival_to_sent_ns, NS_PER_MS, 2)} ms  {residual} mm  "
-        f"{status.valid_coils}/{len(status.coils_missing)} coils  {status.dropped} dropped{_take_text(status)}"
+        f"{wrong}{_take_text(status)}{rate_hz:.0f} Hz {state}  {residual} mm  "
+        f"{status.valid_coils}/{len(status.coils_missing)} coils  {status.dropped} dropped  "
+        f"solve {_pair(status.solve_ns, NS_PER_US, 0)} us  "
+        f"sent {_pair(status.arrival_to_sent_ns, NS_PER_MS, 2)} ms"
     )
 
 
+def whole_parts(line: str, width: int) -> str:
+    """As many of the parts between double spaces as fit: half a number would be another one."""
+    if len(line) <= width:
+        return line
+    end = line.rfind("  ", 0, width + 2)
+    return line[: end if end > 0 else width]
+
+
 def _take_text(status: LiveStatus) -> str:
-    return f"  rec {status.take_frames}" if status.take_path else ""
+    return f"rec {status.take_frames}  " if status.take_path and not status.take_failure else ""
 
 
 def say_above(text: str) -> None:

@@ -210,7 +210,7 @@ CONTROL_FORMS = (
     ControlForm(
         CONTROL_SPEAKER,
         (Argument("fix or free", "s"),),
-        "holds the speaker's weights as they are now, or estimates them on",
+        "fixes the speaker to the mean of what was found so far, or sets it free to be estimated anew",
     ),
 )
 
@@ -305,7 +305,8 @@ BlockingOSCUDPServer(("127.0.0.1", 9000), dispatcher).serve_forever()
 
 Messages may come alone or in bundles, whose time tags are ignored, in datagrams of at most {MAX_DATAGRAM_BYTES} bytes.
 Texts have at most {MAX_CONTROL_TEXT} printable characters. There is no answer. What is not in the table, has other arguments or is
-not OSC is counted and otherwise ignored; whether a take runs is in `/tongue/take`.
+not OSC is ignored; where one of these addresses is used otherwise, `tonguetrack live` says so on its terminal. Whether a
+take runs is in `/tongue/take`.
 
 It listens on this computer only. OSC knows no passwords: opened to a network, it lets anyone there start and
 stop takes. Give it the address of one network interface of this computer only where you trust everyone in that

@@ -6,6 +6,7 @@ import logging
 import re
 import threading
 import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
@@ -22,12 +23,12 @@ from .monitor import decode
 from .osc import listening_socket
 
 DEFAULT_CONTROL = f"127.0.0.1:{DEFAULT_CONTROL_PORT}"
+MAX_TOLD = 20
 TICK_S = 0.2
 """How long `close` may have to wait for the thread."""
 
-# A name becomes part of a file's name: nothing that leads to another folder, nothing hidden, only letters that
-# every file system takes.
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9 _.-]*[A-Za-z0-9_-])?")
+# A name becomes part of a file's name: nothing that leads to another folder, nothing hidden.
+_PLAIN_NAME = re.compile(r"\w([\w .-]*[\w-])?")
 _TAKE: dict[int | str, ControlKind] = {
     1: "take_start",
     0: "take_stop",
@@ -69,10 +70,15 @@ class OscControl:
 
     address: HOST:PORT; port 0 is any free one, and `address` then says which. Raises InputError where it cannot
     listen there. accepted, refused: messages that were obeyed, and messages or datagrams that were not
-    understood. Nothing is ever answered.
+    understood. Nothing is ever answered; what was meant for us and not understood goes to `said`, the first
+    `MAX_TOLD` times.
     """
 
-    def __init__(self, address: str, queue: ControlQueue) -> None:
+    def __init__(
+        self, address: str, queue: ControlQueue, said: Callable[[str], None] = lambda text: None
+    ) -> None:
+        self._said = said
+        self._told = 0
         self.accepted = 0
         self.refused = 0
         self._queue = queue
@@ -121,6 +127,17 @@ class OscControl:
             control = control_of(path, values, time_ns)
             if control is None:
                 self.refused += 1
+                self._tell(path, values)
             else:
                 self.accepted += 1
                 self._queue.put(control)
+
+    def _tell(self, path: str, values: list[object]) -> None:
+        if path not in (CONTROL_TAKE, CONTROL_SPEAKER, *CONTROL_MARKERS) or self._told >= MAX_TOLD:
+            return
+        self._told += 1
+        shown = ascii(values)
+        shown = shown if len(shown) <= 60 else f"{shown[:60]}..."
+        self._said(
+            f"ignored over OSC: {path} {shown}; `tonguetrack monitor --addresses` lists what is understood"
+        )

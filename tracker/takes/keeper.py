@@ -120,12 +120,16 @@ class TakeKeeper:
 
 
 def check_place(place: str | Path) -> None:
-    """Raises InputError where the first take's file exists already, or what should be a folder is a file."""
+    """Raises InputError where the first take's file exists already, or what should be a folder is a file or named so."""
     place = Path(place)
     if is_folder(place):
         if place.exists() and not place.is_dir():
             raise InputError(
                 f"{place}: this is a file; name a folder for takes, or a new file that ends in .xdf."
+            )
+        if not place.exists() and re.fullmatch(r"\.[A-Za-z]\w{1,4}", place.suffix):
+            raise InputError(
+                f"{place}: a take's name ends in .xdf; for a folder of takes choose a name without an ending."
             )
     elif place.exists():
         raise InputError(

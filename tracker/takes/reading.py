@@ -148,6 +148,11 @@ class Take:
         return self.stamps - self.stamps[0] if len(self.stamps) else self.stamps
 
     @property
+    def device_times(self) -> FloatArray:
+        """(frames,) the device's own clock, s."""
+        return self._columns(RAW, range(1))[:, 0]
+
+    @property
     def frame_count(self) -> int:
         return len(self.stamps)
 
@@ -225,7 +230,7 @@ class Take:
     def prepared_recording(self) -> Recording:
         """The tracked coils in the model's frame."""
         self._check_frames()
-        times, rate_hz, notes = take_times(self.stamps, self.info.rate_hz, str(self.path))
+        times, rate_hz, notes = take_times(self.stamps, self.device_times, self.info.rate_hz, str(self.path))
         return Recording(
             coils=self.info.roles,
             positions=self.prepared.reshape(self.frame_count, -1, 3),
@@ -248,7 +253,7 @@ class Take:
         there = np.isin(status, [int(known) for known in PoseStatus])
         if not there.any():
             raise InputError(f"{self.path}: the take has no poses.")
-        times, rate_hz, _ = take_times(self.stamps, info.rate_hz, str(self.path))
+        times, rate_hz, _ = take_times(self.stamps, self.device_times, info.rate_hz, str(self.path))
         widths = [len(POSE_HEAD), len(info.pose_mean), info.speaker_size, len(info.roles)]
         head, weights, speakers, residuals, _ = np.split(pose[there], np.cumsum(widths), axis=1)
         values = dict(zip(POSE_HEAD, head.T, strict=True))

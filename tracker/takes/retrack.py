@@ -65,6 +65,7 @@ def retrack(take: Take, model: TongueModel) -> Retracked:
     recorded[:, _SOLVED_AFTER] = np.nan
     differs = (_bits(pose) != _bits(recorded)).any(axis=1)
     differs |= (_bits(prepared) != _bits(take.prepared)).any(axis=1)
+    differs &= ~np.isnan(recorded).all(axis=1)  # what a damaged take has lost cannot differ
     return Retracked(pose, np.flatnonzero(differs))
 
 
