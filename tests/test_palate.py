@@ -310,6 +310,20 @@ def test_two_channels_that_move_are_not_guessed_between(tmp_path):
         read_palate(tmp_path / "pal.txt", channel="Ch7")
 
 
+def test_tongue_coils_in_the_file_of_the_sweep_must_be_below_it(tmp_path):
+    to_model = directions(NORMPOS, "pal")
+    tongue = np.concatenate([tongue_below(2.0)] * 6) @ to_model
+    dead = np.full((3000, 1, 3), np.nan)
+    swept = sweep()[:, None] @ to_model
+    write_carstens(tmp_path / "pal.txt", np.concatenate([tongue, swept, dead], axis=1))
+    assert "channel Ch4" in read_palate(tmp_path / "pal.txt", tongue=("Ch1", "Ch2", "Ch3")).source
+    assert "channel Ch4" in read_palate(tmp_path / "pal.txt", channel="Ch4", tongue=("Ch5", "TT")).source
+    low = np.concatenate([tongue, swept - [0.0, 0.0, 25.0]], axis=1)
+    write_carstens(tmp_path / "low.txt", low)
+    with pytest.raises(InputError, match=r"low\.txt, channel Ch4: this palate is below the tongue"):
+        read_palate(tmp_path / "low.txt", tongue=("Ch1", "Ch2", "Ch3"))
+
+
 def test_a_file_in_which_nothing_moves_has_no_probe(tmp_path):
     write_carstens(tmp_path / "pal.txt", np.ones((100, 2, 3)))
     with pytest.raises(InputError, match="no coil moves as far; name the channel"):

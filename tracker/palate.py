@@ -7,7 +7,7 @@ the model for tracking motion capture data": palate shape and bite plane of the 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -160,22 +160,22 @@ def _upper_envelope(samples: FloatArray) -> FloatArray:
     bins = max(runs, key=len)
     if len(bins) < 5:  # points that a smoothing spline needs
         return np.zeros((0, 3))
-    y = (bins + 0.5) * BIN_MM
+    y = np.asarray((bins + 0.5) * BIN_MM, dtype=np.float64)
     inside = [samples[place == number] for number in bins]
     spline = _smooth_curve(y, np.array([np.quantile(found[:, 2], QUANTILE) for found in inside]))
     # Again about that curve: on a slope, the quantile of a bin is that of its higher end.
-    heights = [np.quantile(found[:, 2] - spline(found[:, 1]), QUANTILE) for found in inside]
-    spline = _smooth_curve(y, spline(y) + np.array(heights))
+    over = np.array([np.quantile(found[:, 2] - spline(found[:, 1]), QUANTILE) for found in inside])
+    spline = _smooth_curve(y, spline(y) + over)
     # The quantile of noisy samples is above their middle: now the middle of those that are near the curve.
     lateral = np.array([np.median(found[:, 0]) for found in inside])
     for _ in range(ROUNDS):
-        heights = np.zeros(len(bins))
+        over = np.zeros(len(bins))
         for index, found in enumerate(inside):
             off = found[:, 2] - spline(found[:, 1])
             near = np.abs(off) <= ON_PALATE_MM
             if near.any():
-                heights[index], lateral[index] = np.median(off[near]), np.median(found[near, 0])
-        spline = _smooth_curve(y, spline(y) + heights)
+                over[index], lateral[index] = np.median(off[near]), np.median(found[near, 0])
+        spline = _smooth_curve(y, spline(y) + over)
     return np.column_stack([_smooth_curve(y, lateral)(y), y, spline(y)])
 
 
@@ -233,12 +233,14 @@ def read_palate(
     frame: FrameOfReference | None = None,
     unit: str | None = None,
     channel: str | None = None,
+    tongue: Sequence[str] = (),
 ) -> Palate:
     """A palate from a file: a trace (text of 2 or 3 columns), or any recording of a swept probe coil.
 
     frame: the axes, those of the recording that the palate belongs to; needed for a trace, and for a recording that
     does not state them. Two columns stand for its two axes that are not absent. unit: of a trace (mm, cm, um, ...),
-    needed there. channel: the probe, else the one channel that is named as one, else the one that moves.
+    needed there. channel: the probe, else the one channel that is named as one, else the one that moves, apart from
+    the tongue's. tongue: channels of tongue coils; those that the file has must be below the palate.
     Raises InputError that asks for what the file leaves open, and where the numbers are no palate.
     """
     path = Path(path)
@@ -255,9 +257,14 @@ def read_palate(
                 '(for example "left back up").'
             )
         stated = frame
-    probe = _probe_channel(recording, stated, channel)
+    probe = _probe_channel(recording, stated, channel, tongue)
+    others = [index for index, name in enumerate(recording.coils) if name in tongue and index != probe]
+    below = recording.positions[:, others]
     return palate_from_sweep(
-        recording.positions[:, probe], stated, f"{path}, channel {recording.coils[probe]}"
+        recording.positions[:, probe],
+        stated,
+        f"{path}, channel {recording.coils[probe]}",
+        below if np.isfinite(below).any() else None,
     )
 
 
@@ -317,7 +324,9 @@ def _palate_from_trace(
     return curve_palate(points, source, frame)
 
 
-def _probe_channel(recording: Recording, frame: FrameOfReference, channel: str | None) -> int:
+def _probe_channel(
+    recording: Recording, frame: FrameOfReference, channel: str | None, tongue: Sequence[str]
+) -> int:
     """Index of the swept coil: the one named so, else the only one that moves as far as a palate is long."""
     source, coils = recording.source, recording.coils
     if channel is not None:
@@ -331,7 +340,7 @@ def _probe_channel(recording: Recording, frame: FrameOfReference, channel: str |
         return named[0]
     along = recording.positions @ directions(frame, source)[1]
     moving = []
-    for index in range(len(coils)):
+    for index in [index for index, name in enumerate(coils) if name not in tongue]:
         there = along[np.isfinite(along[:, index]), index]
         if len(there) and np.ptp(np.quantile(there, [0.01, 0.99])) >= SHORTEST_MM:
             moving.append(index)
