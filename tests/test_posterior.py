@@ -34,7 +34,7 @@ def test_it_is_the_least_squares_prediction_of_the_mesh_from_noisy_coils():
     targets = np.vstack([deviations, np.zeros((inputs.shape[1], shapes.shape[1]))])
     matrix = np.linalg.lstsq(stacked, targets, rcond=None)[0]
     np.testing.assert_allclose(
-        posterior_from_shapes(shapes, COILS, noise).gain(range(3)), matrix.T, atol=1e-9
+        posterior_from_shapes(shapes, COILS, noise).gain(np.arange(3)), matrix.T, atol=1e-9
     )
 
 

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import InputError
 from .pose import FloatArray
@@ -37,9 +38,9 @@ class LinearPosterior:
     cross: FloatArray
     at_coils: FloatArray
 
-    def gain(self, present: Sequence[int]) -> FloatArray:
-        """(k, 3p) mm per mm: what these p of the coils (their numbers, in order) move in the mesh."""
-        rows = (np.asarray(present, dtype=np.intp)[:, None] * 3 + np.arange(3)).ravel()
+    def gain(self, present: NDArray[np.intp]) -> FloatArray:
+        """(k, 3p) mm per mm: how these coils (p,), by their numbers from 0, move the mesh."""
+        rows = (present[:, None] * 3 + np.arange(3)).ravel()
         return np.asarray(np.linalg.solve(self.at_coils[np.ix_(rows, rows)], self.cross[:, rows].T).T)
 
     def shapes(self, coils: FloatArray) -> FloatArray:
