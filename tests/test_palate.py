@@ -94,8 +94,9 @@ def test_a_palate_moves_as_the_coils_do(angles, shift):
 def test_a_palate_in_other_axes_comes_into_the_models_by_the_coils_own_motion():
     to_model = directions(NORMPOS, "a file")
     source = Palate((ARCH.points_mm @ to_model), "in the file's axes", NORMPOS)
-    with pytest.raises(InputError, match="move it into the model's frame first"):
-        source.height(5.0)
+    points = np.array([[0.0, 5.0, 6.0], [3.0, 20.0, 1.0]])
+    assert source.above(points @ to_model) == pytest.approx(ARCH.above(points))
+    assert source.height(5.0) == ARCH.height(5.0)  # so far back, whatever the axes
     assert np.allclose(source.transformed(to_model, np.zeros(3)).points_mm, ARCH.points_mm)
 
 
@@ -191,17 +192,15 @@ def tongue_below(gap_mm: float, frames=500) -> np.ndarray:
 
 def test_a_tongue_below_its_palate_is_as_it_should_be():
     palate = palate_from_sweep(sweep(noise=0.2), MODEL, "pal.pos", tongue_below(1.5))
-    assert check_above_tongue(palate, tongue_below(1.5), MODEL, "speech.pos") == pytest.approx(-1.5, abs=0.5)
+    assert check_above_tongue(palate, tongue_below(1.5), "speech.pos") == pytest.approx(-1.5, abs=0.5)
 
 
 def test_the_clearance_is_the_same_in_other_axes():
     to_model = directions(NORMPOS, "a file")
     palate = palate_from_sweep(sweep(), MODEL, "pal.pos")
     other = Palate(palate.points_mm @ to_model, "pal.pos", NORMPOS)
-    here = check_above_tongue(palate, tongue_below(2.0), MODEL, "speech.pos")
-    assert check_above_tongue(other, tongue_below(2.0) @ to_model, NORMPOS, "speech.pos") == pytest.approx(
-        here
-    )
+    here = check_above_tongue(palate, tongue_below(2.0), "speech.pos")
+    assert check_above_tongue(other, tongue_below(2.0) @ to_model, "speech.pos") == pytest.approx(here)
 
 
 def test_a_palate_below_the_tongue_is_refused():
@@ -216,7 +215,7 @@ def test_a_palate_far_above_the_tongue_is_refused():
     with pytest.raises(
         InputError, match=r"pal\.pos: the tongue coils of speech\.pos never come within 6\d mm"
     ):
-        check_above_tongue(palate, tongue_below(60.0), MODEL, "speech.pos")
+        check_above_tongue(palate, tongue_below(60.0), "speech.pos")
 
 
 def test_a_palate_that_is_nowhere_over_the_tongue_is_refused():
@@ -224,7 +223,7 @@ def test_a_palate_that_is_nowhere_over_the_tongue_is_refused():
     with pytest.raises(
         InputError, match=r"pal\.pos: no tongue coil of speech\.pos is ever below this palate"
     ):
-        check_above_tongue(palate, tongue_below(1.0) + [0.0, 90.0, 0.0], MODEL, "speech.pos")
+        check_above_tongue(palate, tongue_below(1.0) + [0.0, 90.0, 0.0], "speech.pos")
 
 
 # Files ----------------------------------------------------------------------------------------------
@@ -338,6 +337,29 @@ def test_a_file_that_is_neither_trace_nor_recording_is_refused(tmp_path):
         read_palate(tmp_path / "none.txt")
 
 
+NUMBERS = st.lists(
+    st.lists(
+        st.sampled_from(["0", "-3.5", "40", "1e3", "1e308", "e", "--1", ".", "nan", ""]),
+        min_size=1,
+        max_size=4,
+    ),
+    max_size=12,
+).map(lambda rows: "\n".join(" ".join(row) for row in rows).encode())
+
+
+@settings(max_examples=150, deadline=None)
+@given(content=st.one_of(st.binary(max_size=80), NUMBERS), unit=st.sampled_from([None, "mm", "um"]))
+def test_whatever_a_file_holds_it_is_a_palate_or_refused_in_a_sentence(tmp_path_factory, content, unit):
+    path = tmp_path_factory.getbasetemp() / "anything.dat"
+    path.write_bytes(content)
+    try:
+        palate = read_palate(path, axes_from_words("back up"), unit)
+    except InputError as refusal:
+        assert "anything.dat" in str(refusal)
+    else:
+        assert np.isfinite(palate.points_mm).all()
+
+
 # Real files -----------------------------------------------------------------------------------------
 
 
@@ -351,7 +373,7 @@ def test_the_real_sweep_is_above_the_tongue_of_its_speaker(reference_data):
     )
     speech = open_recording(folder / "ema_original" / "sf2_0005.txt", rate_hz=RATE_HZ)
     tongue = speech.positions[:, [speech.coils.index(name) for name in ("Ch1", "Ch2", "Ch3")]]
-    assert -4.0 < check_above_tongue(palate, tongue, speech.frame, "sf2_0005") < 0.0
+    assert -4.0 < check_above_tongue(palate, tongue, "sf2_0005") < 0.0
     probe = open_recording(folder / "ema_palate" / "sf2_palate.txt", rate_hz=RATE_HZ)
     to_model = directions(palate.frame, "sf2")
     off = palate.transformed(to_model, np.zeros(3)).above(probe.positions[:, 14] @ to_model.T)
@@ -375,7 +397,7 @@ def test_the_real_two_dimensional_trace_is_in_mm_and_above_the_tongue(reference_
         read_palate(folder / "fsew0_pal.dat", speech.frame, "10um")  # the coils' own unit
     palate = read_palate(folder / "fsew0_pal.dat", speech.frame, "mm")
     tongue = speech.positions[:, [speech.coils.index(name) for name in ("tt", "tb", "td")]]
-    assert -5.0 < check_above_tongue(palate, tongue, speech.frame, "fsew0_001") < 0.0
+    assert -5.0 < check_above_tongue(palate, tongue, "fsew0_001") < 0.0
 
 
 def test_the_palate_of_one_real_speaker_is_refused_for_another(reference_data):
@@ -384,7 +406,7 @@ def test_the_palate_of_one_real_speaker_is_refused_for_another(reference_data):
     other = open_recording(folder / "hprc" / "F01_B01_S01_R01_N.mat")
     tongue = other.positions[:, [other.coils.index(name) for name in ("TT", "TB", "TR")]]
     with pytest.raises(InputError, match="no tongue coil of F01"):
-        check_above_tongue(palate, tongue, other.frame, "F01")
+        check_above_tongue(palate, tongue, "F01")
 
 
 # A model --------------------------------------------------------------------------------------------

@@ -70,7 +70,7 @@ class Palate:
             )
         if not np.isfinite(points).all():
             raise InputError(f"{self.source}: a point of the palate is not a finite number.")
-        if (np.diff(points @ directions(self.frame, self.source)[1]) <= 0).any():
+        if (np.diff(points @ self._to_model[1]) <= 0).any():
             raise InputError(
                 f"{self.source}: the points of the palate do not go from front to back, each once."
             )
@@ -78,21 +78,24 @@ class Palate:
         object.__setattr__(self, "points_mm", points)
 
     @cached_property
-    def curve(self) -> tuple[FloatArray, FloatArray]:
-        """y (n,), increasing, and z (n,), mm, contiguous. InputError unless the axes are those of the model."""
-        if not np.array_equal(directions(self.frame, self.source), np.eye(3)):
-            raise InputError(
-                f"{self.source}: this palate is in the axes {self.frame}; move it into the model's frame first."
-            )
-        return self.points_mm[:, 1].copy(), self.points_mm[:, 2].copy()
+    def _to_model(self) -> FloatArray:
+        return directions(self.frame, self.source)
 
-    def height(self, y: FloatArray | float) -> FloatArray:
-        """Height z of the palate, mm, at y (any shape) in the model's axes; NaN before, behind, and where y is."""
-        return np.asarray(np.interp(y, *self.curve, left=np.nan, right=np.nan))
+    @cached_property
+    def curve(self) -> tuple[FloatArray, FloatArray]:
+        """How far back (n,), increasing, and how far up (n,) each point is, mm, whatever the axes; contiguous. In the
+        model's frame these are y and z."""
+        turned = self.points_mm @ self._to_model.T
+        return turned[:, 1].copy(), turned[:, 2].copy()
+
+    def height(self, back: FloatArray | float) -> FloatArray:
+        """How far up the palate is, mm, so far back (any shape), both as in `curve`; NaN before and behind it."""
+        return np.asarray(np.interp(back, *self.curve, left=np.nan, right=np.nan))
 
     def above(self, points: FloatArray) -> FloatArray:
-        """(...) mm by which points (..., 3) lie above the curve (negative: below); NaN where `height` is."""
-        return np.asarray(points[..., 2] - self.height(points[..., 1]))
+        """(...) mm by which points (..., 3), in this palate's own axes, lie above the curve, straight upwards
+        (negative: below); NaN where `height` is."""
+        return np.asarray(points @ self._to_model[2] - self.height(points @ self._to_model[1]))
 
     def transformed(self, rotation: FloatArray, translation: FloatArray) -> Palate:
         """The palate in the model's axes: rotation (3, 3) @ points + translation (3,) mm, ordered front to back again.
@@ -102,9 +105,9 @@ class Palate:
         return curve_palate(self.points_mm @ rotation.T + translation, self.source)
 
     def __str__(self) -> str:
-        y = self.points_mm @ directions(self.frame, self.source)[1]
+        back = self.curve[0]
         strays = f", straying {self.lateral_mm:.1f} mm sideways" if self.lateral_mm else ""
-        return f"{len(y)} points over {np.ptp(y):.0f} mm front to back{strays} ({self.source})"
+        return f"{len(back)} points over {np.ptp(back):.0f} mm front to back{strays} ({self.source})"
 
 
 def curve_palate(points: FloatArray, source: str, frame: FrameOfReference = MODEL_FRAME) -> Palate:
@@ -112,8 +115,7 @@ def curve_palate(points: FloatArray, source: str, frame: FrameOfReference = MODE
     to_model = directions(frame, source)
     turned = points @ to_model.T
     turned = turned[np.lexsort((-turned[:, 2], turned[:, 1]))]
-    first = np.concatenate([[True], np.diff(turned[:, 1]) > 1e-9])
-    kept = turned[first]
+    kept = turned[np.diff(turned[:, 1], prepend=-np.inf) > 1e-9]
     return Palate(kept @ to_model, source, frame, float(np.ptp(kept[:, 0])) if len(kept) else 0.0)
 
 
@@ -147,7 +149,7 @@ def palate_from_sweep(
         )
     palate = curve_palate(envelope @ to_model, source, frame)
     if tongue is not None:
-        check_above_tongue(palate, tongue, frame, source)
+        check_above_tongue(palate, tongue, source)
     return palate
 
 
@@ -193,16 +195,14 @@ def _smooth_curve(y: FloatArray, values: FloatArray) -> Callable[[FloatArray], F
     return spline
 
 
-def check_above_tongue(palate: Palate, tongue: FloatArray, frame: FrameOfReference, source: str) -> float:
+def check_above_tongue(palate: Palate, tongue: FloatArray, source: str) -> float:
     """How far, in mm, the tongue's highest samples (99 %) lie above the palate; negative: below it, as it should be.
 
-    tongue: (frames, n, 3) mm of tongue coils, NaN = missing, in the same place and axes (`frame`) as the palate.
+    tongue: (frames, n, 3) mm of tongue coils, NaN = missing, in the palate's own axes and origin.
     Raises InputError naming `source`, the tongue's recording, where the two contradict each other: no coil below the
     palate at all, the palate below the tongue, or far above it.
     """
-    to_model = directions(frame, source)
-    straight = Palate(palate.points_mm @ to_model.T, palate.source)
-    above = straight.above(tongue.reshape(-1, 3) @ to_model.T)
+    above = palate.above(tongue)
     above = above[np.isfinite(above)]
     if len(above) == 0:
         raise InputError(
@@ -411,7 +411,10 @@ def _contour_height(contour: FloatArray, y: FloatArray) -> FloatArray:
 
 def palate_toml(palate: Palate) -> dict[str, Any]:
     """The content of a session's [palate]; the palate must be in the model's frame."""
-    palate.curve  # noqa: B018  refuses other axes
+    if not np.array_equal(directions(palate.frame, palate.source), np.eye(3)):
+        raise InputError(
+            f"{palate.source}: this palate is in the axes {palate.frame}; move it into the model's frame first."
+        )
     return {"source": palate.source, "points_mm": palate.points_mm.tolist()}
 
 
