@@ -10,12 +10,14 @@ distances at rest where that is more, is changed. The reference with most change
 until those left agree; so four or more references outvote one that slipped, and of three it is the one whose two
 distances changed while the distance of the two others did not. Where counting does not decide (of three references
 one distance changed, of two the only one) it is one that had slipped before, else the one that is farther from where
-the last motion would have it. Distances can not show a slip that changes none of them by the tolerance: one smaller
-than that, or of three references one across their plane.
+the last motion would have it. A slip across the plane of three references changes none of their distances, and those
+to a fourth but little. So where three or more are where the last full motion would have them, one that is not, by the
+tolerance and what a head can do in a frame (`FASTEST_MM_S`), is left out as well. What remains unseen: a slip that is
+smaller or so slow that no distance shows it, and, with three references, one across their plane.
 
 A reference that is left out has no part in that very frame, so an outlier costs its own frame and no more. One that
 was left out for more than `SLIP_S` has slipped: it counts again when all its distances to those that agree have been
-right, to within `RIGHT_SHARE` of the tolerance, for `RETURN_S`. Inside the tolerance a reference weighs the less, the
+right, to within `RIGHT_SHARE` of the tolerance, for `RETURN_S`, and the others' full motion has it there. Inside the tolerance a reference weighs the less, the
 more its distances differ, so that one that slips slowly does not jerk the head when it is left out.
 
 Where fewer than three references count, or those that do lie nearly on one line, a 6-D coil among them gives the
@@ -52,6 +54,8 @@ RETURN_S = 0.2
 RIGHT_SHARE = 0.75
 OFF_LINE_MM = 10.0
 """References that are all nearer to one line than this do not say how far the head is turned about it."""
+FASTEST_MM_S = 500.0
+"""So fast a head that turns about three of its references moves the others, at most."""
 USUAL_RATE_HZ = 250.0
 LEAST_WEIGHT = 1e-3
 REST_PASSES = 3
@@ -89,8 +93,8 @@ _OFF = 5  # distance from where the last motion would have it
 _CHANGED = 6  # how many distances changed
 _DIFFERENCE = 7  # sum of the differences
 _APART = 8  # (k rows) difference of each distance from the one at rest
-# Rows of the motion (5, 3): rotation, translation, then [known, residual, 0].
-_TRANSLATION, _KNOWN, _RESIDUAL = 3, (4, 0), (4, 1)
+# Rows of the motion (5, 3): rotation, translation, then these.
+_TRANSLATION, _KNOWN, _RESIDUAL, _STATUS = 3, (4, 0), (4, 1), (4, 2)
 
 
 @dataclass(frozen=True)
@@ -152,8 +156,10 @@ class HeadCorrector:
         count = len(reference.roles)
         self._rest = np.array(reference.positions_mm, dtype=np.float64, order="C")
         self._rest_quaternions = _quaternions_or_none(reference.orientation, (count, 4))
+        tolerance_mm = reference.tolerance_mm
+        jump_mm = tolerance_mm + FASTEST_MM_S / rate_hz
         self._limits = np.array(
-            [reference.tolerance_mm, max(1.0, SLIP_S * rate_hz), max(1.0, RETURN_S * rate_hz)]
+            [tolerance_mm, max(1.0, SLIP_S * rate_hz), max(1.0, RETURN_S * rate_hz), jump_mm]
         )
         self._memory = np.zeros((_APART + count, count))
         self._work = np.zeros((12, 4))
@@ -460,7 +466,7 @@ def _step(
 ) -> int:
     """One frame: judges the references, then finds the motion; the `HeadStatus`.
 
-    limits: tolerance in mm, frames to slip, frames to return; motion: (5, 3) the last motion, then this one.
+    limits: tolerance in mm, frames to slip, frames to return, jump in mm; motion: (5, 3) the last one, then this one.
     """
     _judge(now, rest, limits, memory, motion, states)
     counting = _weigh(limits[0], memory, states)
@@ -486,7 +492,8 @@ def _step(
         motion[:4] = np.nan
     else:
         motion[_KNOWN] = 1.0
-    _measure(now, rest, memory, motion, states)
+    motion[_STATUS] = status
+    _measure(now, rest, motion, states)
     return status
 
 
@@ -502,9 +509,7 @@ def _off_by_last_motion(now: FloatArray, rest: FloatArray, motion: FloatArray, i
 
 
 @njit(**OPTIONS)
-def _measure(
-    now: FloatArray, rest: FloatArray, memory: FloatArray, motion: FloatArray, states: IntArray
-) -> None:
+def _measure(now: FloatArray, rest: FloatArray, motion: FloatArray, states: IntArray) -> None:
     """The mean distance of the references that count from where the motion takes them."""
     total = 0.0
     counting = 0
@@ -524,19 +529,47 @@ def _judge(
     motion: FloatArray,
     states: IntArray,
 ) -> None:
-    """Finds those whose distances agree, by leaving out the worst again and again, and from that each state."""
-    count = now.shape[0]
-    tolerance = limits[0]
-    for i in range(count):
+    """Each reference's state, from those whose distances agree and from what was found in earlier frames."""
+    followed = motion[_STATUS] == _FULL  # the last motion says where each reference has to be
+    _compare(now, rest, motion, memory, states)
+    if followed:
+        _leave_out_jumps(limits[0], limits[3], memory, states)
+    _leave_out_the_worst(limits[0], memory)
+    for i in range(now.shape[0]):
+        if states[i] == _MISSING:
+            memory[_RIGHT, i] = 0.0
+        elif memory[_AGREES, i] == 0.0:
+            states[i] = _SLIPPED
+            memory[_RIGHT, i] = 0.0
+            memory[_SLIPPING, i] += 1.0
+            if memory[_SLIPPING, i] > limits[1]:
+                memory[_STUCK_OUT, i] = 1.0
+                memory[_SLIPPING, i] = 0.0
+        else:
+            memory[_SLIPPING, i] = max(0.0, memory[_SLIPPING, i] - 1.0)
+            if memory[_STUCK_OUT, i] > 0.0:
+                right = _is_right(memory, limits[0], i) and not (followed and memory[_OFF, i] > limits[3])
+                memory[_RIGHT, i] = memory[_RIGHT, i] + 1.0 if right else 0.0
+                if memory[_RIGHT, i] >= limits[2]:
+                    memory[_STUCK_OUT, i] = 0.0
+                    memory[_RIGHT, i] = 0.0
+                else:
+                    states[i] = _SLIPPED
+
+
+@njit(**OPTIONS)
+def _compare(
+    now: FloatArray, rest: FloatArray, motion: FloatArray, memory: FloatArray, states: IntArray
+) -> None:
+    """Which are there, by how much their distances differ, and how far each is from where the last motion has it."""
+    for i in range(now.shape[0]):
         states[i] = _OK
         for axis in range(3):
             if not abs(now[i, axis]) <= FARTHEST_MM:
                 states[i] = _MISSING
         memory[_AGREES, i] = 1.0 if states[i] == _OK else 0.0
-        off = 0.0
-        if states[i] == _OK and motion[_KNOWN] > 0.0:
-            off = _off_by_last_motion(now, rest, motion, i)
-        memory[_OFF, i] = off
+        known = states[i] == _OK and motion[_KNOWN] > 0.0
+        memory[_OFF, i] = _off_by_last_motion(now, rest, motion, i) if known else 0.0
         for j in range(i):
             apart = apart_at_rest = 0.0
             for axis in range(3):
@@ -545,6 +578,26 @@ def _judge(
             difference = abs(np.sqrt(apart) - np.sqrt(apart_at_rest))
             memory[_APART + i, j] = difference
             memory[_APART + j, i] = difference
+
+
+@njit(**OPTIONS)
+def _leave_out_jumps(tolerance: float, jump: float, memory: FloatArray, states: IntArray) -> None:
+    """Where three or more are where the last motion has them, those that are not do not agree."""
+    in_place = 0
+    for i in range(states.shape[0]):
+        if states[i] == _OK and memory[_STUCK_OUT, i] == 0.0 and memory[_OFF, i] <= tolerance:
+            in_place += 1
+    if in_place >= 3:
+        for i in range(states.shape[0]):
+            # One that was just left out has to be nearer than one that was in place.
+            if memory[_OFF, i] > (jump if memory[_SLIPPING, i] == 0.0 else tolerance):
+                memory[_AGREES, i] = 0.0
+
+
+@njit(**OPTIONS)
+def _leave_out_the_worst(tolerance: float, memory: FloatArray) -> None:
+    """Again and again, until the distances of all that are left are those at rest."""
+    count = memory.shape[1]
     for _ in range(count):
         worst = -1
         for i in range(count):
@@ -563,25 +616,6 @@ def _judge(
         if worst < 0:
             break
         memory[_AGREES, worst] = 0.0
-    for i in range(count):
-        if states[i] == _MISSING:
-            memory[_RIGHT, i] = 0.0
-        elif memory[_AGREES, i] == 0.0:
-            states[i] = _SLIPPED
-            memory[_RIGHT, i] = 0.0
-            memory[_SLIPPING, i] += 1.0
-            if memory[_SLIPPING, i] > limits[1]:
-                memory[_STUCK_OUT, i] = 1.0
-                memory[_SLIPPING, i] = 0.0
-        else:
-            memory[_SLIPPING, i] = max(0.0, memory[_SLIPPING, i] - 1.0)
-            if memory[_STUCK_OUT, i] > 0.0:
-                memory[_RIGHT, i] = memory[_RIGHT, i] + 1.0 if _is_right(memory, tolerance, i) else 0.0
-                if memory[_RIGHT, i] >= limits[2]:
-                    memory[_STUCK_OUT, i] = 0.0
-                    memory[_RIGHT, i] = 0.0
-                else:
-                    states[i] = _SLIPPED
 
 
 @njit(**OPTIONS)
