@@ -140,6 +140,11 @@ def robust_joint_speaker(fold: Fold) -> FloatArray:
     return joint_speaker(fold, robust=True)
 
 
+def speaker_from_meshes(fold: Fold) -> FloatArray:
+    """Experiment 2 with the speaker of the best fit: what a scan of the speaker is worth. It sees the true meshes."""
+    return _with_fixed_speaker(fold, _fit_to_meshes(fold)[0])
+
+
 def gaussian_posterior(fold: Fold) -> FloatArray:
     """The linear Gaussian posterior of the pooled training shapes (`posterior`); no tracking energy, no model."""
     noise_mm = max(fold.noise_mm, LEAST_POSTERIOR_NOISE_MM)
@@ -160,20 +165,8 @@ def swept_fit(fold: Fold) -> FloatArray:
 
 def best_fit(fold: Fold) -> FloatArray:
     """One speaker and the poses with the least squared distance to the whole true meshes, in the tracker's box."""
-    core, truth = _reduced(fold.model, fold.truth)
-    model = replace(
-        fold.model,
-        core=core,
-        origin=np.zeros(core.shape[2]),
-        faces=np.zeros((0, 3), np.int32),
-        marks=SurfaceMarks(),
-    )
-    estimator = SpeakerEstimator(model, DATA_ONLY, len(truth))
-    estimate = estimator.estimate(truth.reshape(len(truth), -1, 3), robust=False)
-    assert estimate is not None  # meshes are complete
-    return _shapes(
-        fold.model, np.broadcast_to(estimate.weights, (len(truth), len(core))), np.array(estimator.poses)
-    )
+    speaker, poses = _fit_to_meshes(fold)
+    return _shapes(fold.model, np.broadcast_to(speaker, (len(poses), len(speaker))), poses)
 
 
 LOWER_BRACKET = "best fit"
@@ -184,6 +177,7 @@ ESTIMATORS: Mapping[str, Callable[[Fold], FloatArray]] = {
     "experiment 2": experiment_2,
     "joint speaker": joint_speaker,
     "joint speaker, robust": robust_joint_speaker,
+    "speaker from meshes": speaker_from_meshes,
     "Gaussian posterior": gaussian_posterior,
     f"best fit, {SWEEPS} sweeps": swept_fit,
     LOWER_BRACKET: best_fit,
@@ -209,6 +203,23 @@ def _with_fixed_speaker(fold: Fold, weights: FloatArray) -> FloatArray:
     speaker = fold.model.for_speaker(weights)
     poses = _each_frame_by_itself(FixedSpeakerSolver(speaker.at(fold.vertices), ENERGY), fold.coils)
     return np.asarray(speaker.base + poses @ speaker.directions)
+
+
+def _fit_to_meshes(fold: Fold) -> tuple[FloatArray, FloatArray]:
+    """(m,) speaker and (T, n) poses of the best fit."""
+    core, truth = _reduced(fold.model, fold.truth)
+    reduced = replace(
+        fold.model,
+        core=core,
+        origin=np.zeros(core.shape[2]),
+        faces=np.zeros((0, 3), np.int32),
+        marks=SurfaceMarks(),
+    )
+    # Three coordinates of the basis make a coil: the joint estimate then is that of the whole mesh.
+    estimator = SpeakerEstimator(reduced, DATA_ONLY, len(truth))
+    estimate = estimator.estimate(truth.reshape(len(truth), -1, 3), robust=False)
+    assert estimate is not None  # meshes are complete
+    return estimate.weights, estimator.poses
 
 
 def _each_frame_by_itself(solver: FreeSpeakerSolver | FixedSpeakerSolver, coils: FloatArray) -> FloatArray:
