@@ -15,6 +15,7 @@ from ..drivers.frames import CoilFrame, NoteKind, Recording, SourceNote
 from ..drivers.replay import ReplaySource
 from ..model.multilinear import TongueModel
 from .control import Control, ControlQueue
+from .headcorrection import ReferenceState
 from .online import Tracker
 from .pose import PoseStatus, TrackedPose
 from .session import session_toml
@@ -106,6 +107,7 @@ class LiveRun:
     def run(self) -> Summary:
         """As `run_live`."""
         self.tracker.warm_up()
+        self.status.head_troubles = self._head_troubles
         for sink in self.sinks:
             sink.start(self.info)
         try:
@@ -166,6 +168,10 @@ class LiveRun:
         refusal, keeper.refusal = keeper.refusal, ""
         if refusal:
             self.said(refusal)
+
+    def _head_troubles(self) -> list[tuple[str, str]]:
+        states = self.tracker.head_states.items()
+        return [(role, state.name.lower()) for role, state in states if state != ReferenceState.OK]
 
     def _take(self, recorder: TakeRecorder | None, next_arrival_ns: int) -> TakeRecorder | None:
         """A take begins or has ended. It begins with a tracker that knows nothing, as its replay will."""

@@ -14,6 +14,7 @@ import numpy as np
 from ..drivers.frames import CoilFrame
 from ..model.multilinear import TongueModel
 from .guard import CoilGuard
+from .headcorrection import ReferenceState
 from .pose import CoilState, FloatArray, PoseStatus, TrackedPose
 from .preparation import Preparation
 from .session import Session
@@ -82,6 +83,11 @@ class Tracker:
         """(n, 3) those of them that counted."""
         return self._guard.used if self._watchful else self._preparation.coils
 
+    @property
+    def head_states(self) -> dict[str, ReferenceState]:
+        """What became of each reference coil of the head in the last frame; empty without head correction."""
+        return self._preparation.head_states
+
     def warm_up(self) -> None:
         """Compiles or loads every kernel that a frame may need, also those of a speaker that is fixed later.
 
@@ -107,6 +113,7 @@ class Tracker:
         """As if no frame had ever come; the set-up stays."""
         self._solver.reset()
         self._guard.reset()
+        self._preparation.reset()
         self._time_s = 0.0
         self._last_device_s: float | None = None
         self._without_s = 0.0
@@ -157,7 +164,7 @@ class Tracker:
             step_s = self._advance(frame.device_time_s)
             status = self._watch(frame, step_s)
         else:
-            coils = self._preparation.frame(frame.positions, step_s)
+            coils = self._preparation.frame(frame.positions, step_s, frame.quaternions)
             status = solver.solve(coils)
             np.isnan(coils[:, 0], out=self._guard.states, casting="unsafe")  # MISSING = 1, TRUSTED = 0
         if self._averages and status == PoseStatus.OK:
@@ -177,7 +184,7 @@ class Tracker:
     def _watch(self, frame: CoilFrame, step_s: float) -> int:
         """Solves with the coils that can be trusted; the status."""
         solver, guard = self._solver, self._guard
-        coils = self._preparation.frame(frame.positions, step_s)
+        coils = self._preparation.frame(frame.positions, step_s, frame.quaternions)
         status = solver.solve(guard.admit(coils, self._time_s))
         residuals = solver.residuals_mm
         if not guard.all_counted:
@@ -221,6 +228,7 @@ class Tracker:
         if step_s < 0.0 or step_s > self._reset_s:
             self._solver.reset()
             self._guard.resume()
+            self._preparation.reset()
             self._without_s = 0.0
         if not 0.0 < step_s <= self._reset_s:
             step_s = self.period_s  # also where the device has no clock

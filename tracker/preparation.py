@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from .. import InputError
 from . import kernels
-from .headcorrection import HeadCorrector, HeadReference, head_motion
+from .headcorrection import HeadCorrector, HeadReference, ReferenceState, head_motion
 from .pose import FloatArray
 from .session import Alignment
-from .smoothing import NO_SMOOTHING, CausalSmoother, Smoothing, smooth
+from .smoothing import NO_SMOOTHING, CausalSmoother, Filter, Smoothing, smooth
 
 
 class Preparation:
@@ -43,10 +43,10 @@ class Preparation:
         self._midsagittal = alignment.midsagittal
         self._head = head
         self._references = np.zeros(0, np.int64) if references is None else np.ascontiguousarray(references)
-        self._corrector = HeadCorrector(head) if head is not None else None
-        self.head_status = 0
+        self._corrector = HeadCorrector(head, rate_hz) if head is not None else None
         self._head_rotation, self._head_translation = np.eye(3), np.zeros(3)
         self._reference_positions = np.full((len(self._references), 3), np.nan)
+        self._reference_quaternions = np.full((len(self._references), 4), np.nan)
         self._smoothing = smoothing
         # Channels in the order in which a frame is copied, with the role that says how each is smoothed.
         head_roles = head.roles if head is not None else ()
@@ -60,7 +60,7 @@ class Preparation:
         self._smoother = CausalSmoother(live, rate_hz) if any(live) else None
         self._smooth_raw = np.zeros_like(self._raw)
 
-    def _filter_of(self, channel: int, live: bool) -> object:
+    def _filter_of(self, channel: int, live: bool) -> Filter | None:
         role = self._role_of.get(channel)
         return None if role is None else self._smoothing.of(role, live)
 
@@ -76,10 +76,21 @@ class Preparation:
         if self._corrector is not None:
             self._corrector.reset()
 
-    def frame(self, raw: FloatArray, step_s: float = 0.0) -> FloatArray:
+    @property
+    def head_states(self) -> dict[str, ReferenceState]:
+        """What became of each reference coil in the last frame; empty without head correction."""
+        if self._corrector is None or self._head is None:
+            return {}
+        states = self._corrector.states.tolist()
+        return {role: ReferenceState(state) for role, state in zip(self._head.roles, states, strict=True)}
+
+    def frame(
+        self, raw: FloatArray, step_s: float = 0.0, quaternions: FloatArray | None = None
+    ) -> FloatArray:
         """Fills and returns `self.coils` (n, 3) from raw (all coils, 3); NaN = missing in both.
 
-        step_s: time since the frame before, for smoothing.
+        step_s: time since the frame before, for smoothing; quaternions: (all coils, 4), for a reference with
+        six degrees of freedom.
         """
         if len(raw) < len(self._raw):
             raise InputError(
@@ -97,8 +108,13 @@ class Preparation:
             )
             return self.coils
         np.take(used, self._references, axis=0, out=self._reference_positions)
-        self.head_status = self._corrector.step(
-            self._reference_positions, self._head_rotation, self._head_translation
+        if quaternions is not None:
+            np.take(quaternions, self._references, axis=0, out=self._reference_quaternions)
+        self._corrector.step(
+            self._reference_positions,
+            self._head_rotation,
+            self._head_translation,
+            None if quaternions is None else self._reference_quaternions,
         )
         kernels.prepare_on_moving_head(
             used, self._picked, self._head_rotation, self._head_translation, self._rotation, self._translation,
@@ -106,8 +122,10 @@ class Preparation:
         )  # fmt: skip
         return self.coils
 
-    def all_frames(self, raw: FloatArray, rate_hz: float = 250.0) -> FloatArray:
-        """(frames, n, 3) from raw (frames, all coils, 3) of a recording with that rate."""
+    def all_frames(
+        self, raw: FloatArray, rate_hz: float = 250.0, quaternions: FloatArray | None = None
+    ) -> FloatArray:
+        """(frames, n, 3) from raw (frames, all coils, 3) and quaternions (frames, all coils, 4) of a recording."""
         # A read-only array is another type for the compiler; such a one is copied.
         raw = np.require(raw, np.float64, ["C_CONTIGUOUS", "WRITEABLE"])
         filters = [self._filter_of(channel, live=False) for channel in range(self.channels_needed)]
@@ -119,7 +137,8 @@ class Preparation:
                 raw, self._picked, self._rotation, self._translation, self._midsagittal, prepared
             )
             return prepared
-        motion = head_motion(np.ascontiguousarray(raw[:, self._references]), self._head)
+        turned = None if quaternions is None else quaternions[:, self._references]
+        motion = head_motion(raw[:, self._references], self._head, rate_hz, turned)
         still = np.zeros(raw.shape[1:])
         for frame in range(len(raw)):
             kernels.prepare_on_moving_head(

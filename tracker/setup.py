@@ -69,7 +69,7 @@ def complete_setup(recording: Recording, model: TongueModel, session: Session) -
     if len(stated) == len(roles):
         vertices = tuple(stated[role] for role in roles)
     else:
-        coils = preparation.all_frames(recording.positions, recording.rate_hz)
+        coils = preparation.all_frames(recording.positions, recording.rate_hz, recording.quaternions)
         found = estimate_correspondences(model, coils, roles, session.energy)
         vertices = tuple(stated.get(role, vertex) for role, vertex in zip(roles, found.vertices, strict=True))
         decisions.append(f"correspondences (estimated): {found}")
@@ -114,7 +114,13 @@ def preparation_of(
                 )
         references = picked_channels(available, [channel_of[role] for role in head.roles])
     return Preparation(
-        picked_channels(available, channels), session.alignment, roles, head, references, session.smoothing, rate_hz
+        picked_channels(available, channels),
+        session.alignment,
+        roles,
+        head,
+        references,
+        session.smoothing,
+        rate_hz,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -64,6 +64,7 @@ class LiveStatus:
     device_to_host_ns: what `DeviceDelay` says; host_to_solved_ns, solved_to_sent_ns, arrival_to_sent_ns: on this
     host's clock; solve_ns: one tracker step.
     coils_missing, coils_distrusted: (n,) frames in which each coil was absent, or there and did not count.
+    head_troubles: asked for reference coils of the head that do not count, and why.
     coil_states: (n,) of the latest frame. silent_s: how long the source has been silent, 0.0 = it is not; away_s:
     all such silences before it together.
     """
@@ -95,6 +96,7 @@ class LiveStatus:
         self.coils_missing = np.zeros(coils, np.int64)
         self.coils_distrusted = np.zeros(coils, np.int64)
         self.coil_states = np.full(coils, CoilState.MISSING, np.int64)
+        self.head_troubles: Callable[[], list[tuple[str, str]]] = list
         self.sinks = tuple(sinks)
         self.take_path, self.take_frames, self.take_backlog, self.take_failure = "", 0, 0, ""
         self._absent = np.zeros(coils, np.bool_)
@@ -183,6 +185,7 @@ class LiveStatus:
             for role, state in zip(self.roles, self.coil_states, strict=True)
             if state != CoilState.TRUSTED
         ]
+        states += [f"{role} {word}" for role, word in self.head_troubles()]
         if self.misplaced:
             states.append(f"coils {self.residuals.mean:.0f} mm from the model: see [alignment]")
         if self.silent_s > 0.0:

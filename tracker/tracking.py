@@ -45,7 +45,7 @@ def track_recording(
         raise InputError(f"{recording.source}: the recording has no frames.")
     setup = setup or complete_setup(recording, model, session or Session())
     energy = setup.session.energy
-    coils = setup.preparation.all_frames(recording.positions, recording.rate_hz)
+    coils = setup.preparation.all_frames(recording.positions, recording.rate_hz, recording.quaternions)
     at_coils = model.at(setup.vertices)
     if np.isnan(coils[:, :, 0]).all():
         raise InputError(

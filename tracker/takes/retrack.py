@@ -12,9 +12,8 @@ from ...drivers.frames import CoilFrame
 from ...model.multilinear import TongueModel
 from ..online import Tracker
 from ..pose import FloatArray
-from ..preparation import Preparation
 from ..session import Session, parse_session
-from ..setup import Setup
+from ..setup import Setup, preparation_of
 from .layout import POSE_HEAD
 from .reading import Take
 
@@ -70,13 +69,12 @@ def retrack(take: Take, model: TongueModel) -> Retracked:
 
 
 def _setup(take: Take, session: Session) -> Setup:
-    channels = {role: channel for channel, role in session.coils.items()}
-    picked = [
-        take.info.coils.index(channels[role]) if role in channels else place
-        for place, role in enumerate(take.info.roles)
-    ]
-    preparation = Preparation(np.array(picked), session.alignment)
-    return Setup(take.info.coils, take.info.roles, take.info.vertices, preparation, session, ())
+    info = take.info
+    channel_of = {role: channel for channel, role in session.coils.items()}
+    # Points of the authors' clients have no coil map: they are tracked in their own order.
+    channels = [channel_of.get(role, coil) for role, coil in zip(info.roles, info.coils, strict=False)]
+    preparation = preparation_of(info.coils, channels, info.roles, session, info.rate_hz)
+    return Setup(tuple(channels), info.roles, info.vertices, preparation, session, ())
 
 
 def _step(tracker: Tracker, frame: CoilFrame, row: FloatArray) -> None:
