@@ -33,6 +33,7 @@ from tonguetrack.tracker.evaluation import (
     training_without,
     vertex_distances,
 )
+from tonguetrack.tracker.evaluationreport import REPORT_FILES
 
 TEMPLATE = tongue_template()
 REGION = {"tip": TEMPLATE.regions["tip"]}
@@ -240,9 +241,7 @@ def test_the_command_prints_a_table_and_writes_the_same_numbers(database, tmp_pa
     report = tmp_path / "new" / "report"
     assert run(database, *COILS_FLAG, *MODES, "--regions", "tip,combined", "-o", str(report)) == 0
     table = capsys.readouterr().out
-    names = {path.name for path in report.iterdir()}
-    assert names == {"evaluation.json", "evaluation.csv", "evaluation.txt", "estimators.png", "estimators.svg",
-                     "phones.png", "phones.svg"}  # fmt: skip
+    assert {path.name for path in report.iterdir()} == set(REPORT_FILES)
     assert table.strip() in (report / "evaluation.txt").read_text(encoding="utf-8")
     content = json.loads((report / "evaluation.json").read_text(encoding="utf-8"))
     assert content["plan"]["coils"] == list(PLACES)
@@ -260,6 +259,14 @@ def test_the_command_prints_a_table_and_writes_the_same_numbers(database, tmp_pa
             assert f"{mean:.2f} +- " in line
     assert (report / "estimators.png").read_bytes().startswith(b"\x89PNG")
     assert b"<svg" in (report / "phones.svg").read_bytes()
+
+
+def test_the_report_never_replaces_the_database(database, tmp_path, capsys):
+    samples = tmp_path / "evaluation.json"
+    samples.write_bytes(database.read_bytes())
+    assert run(samples, *COILS_FLAG, *MODES, "-o", str(tmp_path)) == 2
+    assert "would be overwritten" in capsys.readouterr().err
+    assert samples.read_bytes() == database.read_bytes()
 
 
 def test_a_report_without_matplotlib_is_refused_before_the_work(database, tmp_path, capsys, monkeypatch):

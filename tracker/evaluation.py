@@ -15,10 +15,10 @@ procedure, for every speaker of a sample database in turn:
 4. Error: mean distance between corresponding vertices, over all of the mesh, over a region, over the coils' vertices (to
    the true vertex, without noise); mean over the phones, then over the speakers.
 
-Brackets: the mean shape (mean of all training shapes) knows nothing of the coils. The best fit knows the
-whole true mesh: one s for the speaker, one p a phone, least squares over all vertices. `best fit` is its minimum in
-the tracker's box. `best fit, 40 sweeps` is what 40 sweeps of alternating least squares without a box come to from the
-mean weights, which is how such figures are often given, though the sweeps are far from done by then.
+Brackets: the mean shape (mean of all training shapes) knows nothing of the coils. The best fit knows the whole true
+mesh: one s for the speaker, one p a phone, least squares over all vertices. `best fit` is its minimum in the
+tracker's box. `best fit, 40 sweeps` is what 40 sweeps of alternating least squares, begun at the mean weights and
+without a box, come to; they are far from done by then, but earlier figures were made so.
 """
 
 from __future__ import annotations

@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PICTURE_SUFFIXES = (".png", ".svg")
+REPORT_FILES = (
+    *("evaluation.json", "evaluation.csv", "evaluation.txt"),
+    *("estimators.png", "estimators.svg", "phones.png", "phones.svg"),
+)
 MOST_COLUMNS = 3  # panels side by side
 
 
@@ -104,19 +107,18 @@ def as_csv(evaluation: Evaluation) -> str:
 
 
 def write_report(evaluation: Evaluation, source: str, folder: Path) -> list[Path]:
-    """Writes evaluation.json, .csv, .txt and the pictures estimators and phones, .png and .svg, into the folder."""
+    """Writes the REPORT_FILES into the folder; returns where they are."""
     text = f"{describe_plan(evaluation, source)}\n\n{text_table(evaluation)}\n"
-    written = [
-        write_atomically(folder / "evaluation.json", _json_bytes(as_json(evaluation, source))),
-        write_atomically(folder / "evaluation.csv", as_csv(evaluation).encode()),
-        write_atomically(folder / "evaluation.txt", text.encode()),
-    ]
-    for name, figure in (("estimators", draw_estimators(evaluation)), ("phones", draw_phones(evaluation))):
-        for suffix in PICTURE_SUFFIXES:
+    numbers = json.dumps(as_json(evaluation, source), ensure_ascii=False, indent=1, allow_nan=False)
+    contents = [numbers.encode(), as_csv(evaluation).encode(), text.encode()]
+    for figure in (draw_estimators(evaluation), draw_phones(evaluation)):
+        for kind in ("png", "svg"):
             picture = io.BytesIO()
-            figure.savefig(picture, format=suffix[1:], dpi=130)
-            written.append(write_atomically(folder / f"{name}{suffix}", picture.getvalue()))
-    return written
+            figure.savefig(picture, format=kind, dpi=130)
+            contents.append(picture.getvalue())
+    return [
+        write_atomically(folder / name, content) for name, content in zip(REPORT_FILES, contents, strict=True)
+    ]
 
 
 def require_plotting() -> None:
@@ -197,7 +199,3 @@ def _panels(evaluation: Evaluation, height: float) -> tuple[Figure, list[Axes]]:
 def _columns(evaluation: Evaluation) -> int:
     rows = math.ceil(len(evaluation.parts) / MOST_COLUMNS)
     return math.ceil(len(evaluation.parts) / rows)
-
-
-def _json_bytes(content: dict[str, Any]) -> bytes:
-    return json.dumps(content, ensure_ascii=False, indent=1, allow_nan=False).encode()

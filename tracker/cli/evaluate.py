@@ -66,7 +66,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run_evaluate(args: argparse.Namespace) -> int:
     from ...model.build import load_training_shapes, read_sample_database
     from ..evaluation import Plan, evaluate
-    from .names import as_text, prepare_folder
+    from .names import as_text, keep_apart, prepare_folder
 
     plan = Plan(
         parse_vertices(args.coils),
@@ -79,10 +79,13 @@ def run_evaluate(args: argparse.Namespace) -> int:
     database = read_sample_database(args.samples)
     regions = chosen_regions(database.marks.regions, args.region_file, args.regions, args.samples)
     if args.output is not None:
-        from ..evaluationreport import require_plotting
+        from ..evaluationreport import REPORT_FILES, require_plotting
 
         require_plotting()
-        prepare_folder(Path(args.output) / "evaluation.json")
+        files = [Path(args.output) / name for name in REPORT_FILES]
+        read = [stated.partition("=")[2] for stated in args.region_file]
+        keep_apart(files, map(Path, [args.samples, *read]))
+        prepare_folder(files[0])
     evaluation = evaluate(load_training_shapes(database), plan, regions, _with_progress)
 
     from ..evaluationreport import describe_plan, text_table, write_report
