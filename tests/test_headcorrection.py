@@ -414,6 +414,21 @@ def test_a_6d_reference_among_three_steps_in_when_the_others_fail():
     np.testing.assert_allclose(motion.rotations, rotations, atol=1e-9)
 
 
+def test_the_6d_sensor_of_a_real_sweep_turns_as_the_points_on_the_head_do(reference_data):
+    """Sensor 1 of a Wave is six-dimensional; it and four more sit on the head, which turns by 5 degrees meanwhile."""
+    sweep = open_recording(reference_data / "recordings" / "ndi_wave_ematoblender" / "Example3.tsv")
+    head = [sweep.coils.index(f"Sensor {number}") for number in (1, 9, 14, 15, 16)]
+    roles = tuple(f"head_{index}" for index in head)
+    points = head_motion(
+        sweep.positions[:, head], rest_reference(sweep.positions[:20, head], roles, "points")
+    )
+    one, turned = sweep.positions[:, head[:1]], sweep.quaternions[:, head[:1]]
+    sensor = head_motion(one, rest_reference(one[:20], roles[:1], "6-D", turned[:20]), quaternions=turned)
+    end = slice(-4, None)  # when the head turns; single frames of the points are off by 2 degrees
+    assert apart_degrees(points.rotations[end], np.broadcast_to(np.eye(3), (4, 3, 3))).min() > 3.0
+    assert np.median(apart_degrees(sensor.rotations[end], points.rotations[end])) < 0.8
+
+
 # The rest interval -----------------------------------------------------------------------------------
 
 
@@ -436,6 +451,23 @@ def test_outliers_gaps_and_a_slip_within_the_rest_interval_do_no_harm():
     rest[300:330, 2] = np.nan
     found = rest_reference(rest, ROLES, "rest")
     np.testing.assert_allclose(found.positions_mm, AT_REST, atol=0.15)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=60, deadline=None)
+def test_the_rest_reference_of_any_data_is_whole_or_refused(seed):
+    random = np.random.default_rng(seed)
+    rest = at_rest_with(0.3, int(random.integers(1, 40)), seed)
+    rest += random.choice([0.0, 0.0, 0.0, 3.0, 30.0], rest.shape[:2])[:, :, None] * random.normal(
+        size=rest.shape
+    )
+    rest[random.random(rest.shape[:2]) < 0.2] = np.nan
+    try:
+        found = rest_reference(rest, ROLES, "rest")
+    except InputError:
+        return
+    assert np.isfinite(found.positions_mm).all()
+    assert head_motion(found.positions_mm[None], found).statuses == HeadStatus.OK
 
 
 def test_the_shape_at_rest_is_exact_although_the_head_moves():

@@ -257,17 +257,17 @@ def rest_reference(
     and no 6-D one, where all lie on one line, and where they move against each other by more than the tolerance.
     """
     turning = _quaternions_or_none(quaternions, (*positions.shape[:2], 4))
-    six_d = np.isfinite(turning).all(axis=2)
+    six_d: NDArray[np.bool_] = np.asarray(np.isfinite(turning).all(axis=2))
     if not six_d.any():
         _check_count(roles, source)
-    there = np.isfinite(positions).all(axis=2)
-    for role, found in zip(roles, there.any(axis=0), strict=True):
-        if not found:
+    there: NDArray[np.bool_] = np.asarray(np.isfinite(positions).all(axis=2))
+    for coil, role in enumerate(roles):
+        if not there[:, coil].any():
             raise InputError(
                 f"{source}: the reference coil {role} is never there; leave it out of the references or take another "
                 "interval."
             )
-    wanted = there & (six_d | ~six_d.any(axis=0))
+    wanted: NDArray[np.bool_] = np.asarray(there & (six_d | ~six_d.any(axis=0)))
     complete = np.flatnonzero(wanted.all(axis=1))
     if len(complete) == 0:
         shares = zip(roles, wanted.mean(axis=0), strict=True)
@@ -390,7 +390,8 @@ def _median_reference(
     reference: HeadReference, positions: FloatArray, quaternions: FloatArray
 ) -> HeadReference:
     """The medians of the references that count, brought to `reference`, and placed where the head was on the median."""
-    motion = head_motion(positions, reference, quaternions=quaternions)
+    # One frame a second: then each frame is judged by itself, for a slip that ends needs one frame to be forgotten.
+    motion = head_motion(positions, reference, 1.0, quaternions)
     counted = motion.states == _OK
     counted[motion.statuses != _FULL] = False
     shape = np.nanmedian(np.where(counted[:, :, None], correct(positions, motion), np.nan), axis=0)
