@@ -234,13 +234,16 @@ def read_palate(
     unit: str | None = None,
     channel: str | None = None,
     tongue: Sequence[str] = (),
+    prepare: Callable[[Recording], Recording] | None = None,
 ) -> Palate:
     """A palate from a file: a trace (text of 2 or 3 columns), or any recording of a swept probe coil.
 
     frame: the axes, those of the recording that the palate belongs to; needed for a trace, and for a recording that
     does not state them. Two columns stand for its two axes that are not absent. unit: of a trace (mm, cm, um, ...),
     needed there. channel: the probe, else the one channel that is named as one, else the one that moves, apart from
-    the tongue's. tongue: channels of tongue coils; those that the file has must be below the palate.
+    the tongue's. tongue: channels of tongue coils; those that the file has must be below the palate. prepare: what is done
+    with a recording before anything else, as to take the head's motion out and turn it; the palate is then in the frame
+    that it gives back.
     Raises InputError that asks for what the file leaves open, and where the numbers are no palate.
     """
     path = Path(path)
@@ -249,6 +252,8 @@ def read_palate(
         return _palate_from_trace(table, frame, unit, str(path))
     # The rate plays no part in where the probe was; some exports do not state it.
     recording = open_recording(path, rate_hz=PROBE_RATE_HZ, unit=unit)
+    if prepare is not None:
+        recording = prepare(recording)
     stated = recording.frame
     if "unknown" in (stated.x, stated.y, stated.z):
         if frame is None:

@@ -50,6 +50,10 @@ def handedness(rotation: FloatArray) -> str:
     return "right-handed" if np.linalg.det(rotation) > 0 else "left-handed"
 
 
+class PlaneUnclear(InputError):
+    """The coils do not tell how the plane lies, as they are too few or on a line; nothing contradicts anything."""
+
+
 @dataclass(frozen=True)
 class MidSagittalPlane:
     """The plane in which mid-sagittal coils move, in the frame of the coils it was found from.
@@ -88,21 +92,21 @@ def mid_sagittal_plane(positions: FloatArray, left: FloatArray, source: str) -> 
 
     positions: (frames, n, 3) mm, head-corrected, NaN = missing; coils that sit in the mid-sagittal plane. left: (3,)
     roughly the speaker's left, as `directions(...)[0]`. Every coil counts the same, and samples far off the plane
-    count little. Raises InputError where the coils lie on a line, so that any plane through it would do, and where
-    the plane contradicts `left`.
+    count little. Raises PlaneUnclear where the coils lie on a line, so that any plane through it would do, and InputError
+    where the plane contradicts `left`.
     """
     coils = [coil[np.isfinite(coil).all(axis=1)] for coil in np.moveaxis(positions, 1, 0)]
     there = [index for index, coil in enumerate(coils) if len(coil)]
     samples = [coils[index] for index in there]
     if sum(len(coil) for coil in samples) < 3:
-        raise InputError(
+        raise PlaneUnclear(
             f"{source}: fewer than three samples of its mid-sagittal coils; a plane needs more speech."
         )
     left = left / np.linalg.norm(left)
     normal, point, off, extents = _robust_plane(samples, left)
     spread = 1.4826 * float(np.median(np.abs(off)))
     if extents[1] < max(LEAST_EXTENT_MM, CLEAR_RATIO * extents[0]):
-        raise InputError(
+        raise PlaneUnclear(
             f"{source}: its mid-sagittal coils stay within {extents[1]:.1f} mm of a straight line and scatter "
             f"{extents[0]:.1f} mm off their plane, so they do not tell how the plane lies; take a recording with more "
             "tongue movement, or rely on the stated axes."

@@ -65,3 +65,23 @@ def add_recording_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, metavar="HZ", help="sampling rate, where the file states none")
     parser.add_argument("--unit", help="unit of positions, where the file states none: m dm cm mm 10um um")
     parser.add_argument("--layout", help="vector or angles (AG500 .pos without header); raw or filt (SSFF)")
+
+
+def parsed_coils(text: str) -> dict[str, str]:
+    """CHANNEL=ROLE,... as channel -> role, each once."""
+    from ..coilmap import checked_coil_map
+
+    coils: dict[str, str] = {}
+    for pair in text.split(","):
+        if not pair.strip():
+            continue
+        channel, _, role = (part.strip() for part in pair.partition("="))
+        if not channel or not role:
+            raise InputError(f"--coils {text}: expected CHANNEL=ROLE pairs with commas between them.")
+        if channel in coils:
+            raise InputError(
+                f"--coils: the channel '{channel}' is named twice, as {coils[channel]} and as {role}; name it once."
+            )
+        coils[channel] = role
+    checked_coil_map(coils, "--coils")
+    return coils

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ... import InputError
-from .names import BUNDLED, add_recording_flags, keep_apart, named_model, prepare_folder
+from .names import BUNDLED, add_recording_flags, keep_apart, named_model, parsed_coils, prepare_folder
 
 if TYPE_CHECKING:
     from ...drivers.frames import Recording
@@ -233,21 +233,12 @@ def _output_pattern(out: str, recordings: int) -> tuple[str, bool]:
 
 def read_session(args: argparse.Namespace) -> Session:
     """The session file, with what --coils says on top."""
-    from ..coilmap import checked_coil_map
     from ..session import Session, load_session
 
     session = load_session(args.session) if args.session else Session()
     if not args.coils:
         return session
-    pairs = [
-        tuple(part.strip() for part in pair.partition("=")) for pair in args.coils.split(",") if pair.strip()
-    ]
-    if any(not channel or not role for channel, _, role in pairs):
-        raise InputError(f"--coils {args.coils}: expected CHANNEL=ROLE pairs with commas between them.")
-    coils = {channel: role for channel, _, role in pairs}
-    if len(coils) != len(pairs):
-        raise InputError(f"--coils {args.coils}: a channel is named twice.")
-    checked_coil_map(coils, "--coils")
+    coils = parsed_coils(args.coils)
     return replace(session, coils=coils, source=session.source if args.session else "--coils")
 
 
