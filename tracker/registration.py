@@ -1,0 +1,694 @@
+"""The rigid motion that brings a speaker's coils into the model's frame, found with the model itself.
+
+Paper, section "Data selection and setup for experiments": "we used the palate shape and the bite plane of the
+subject to rigidly align the data to our tongue model in a semi-supervised way". Here: a first guess, from a bite
+plane or from axes alone, says how far it may be wrong; the tracking residuals over frames spread through the
+recording say the rest, and the palate is an upper bound.
+
+Residuals alone cannot do it: a model with free weights follows coils that are 35 mm away, or turned by 40 degrees,
+about as closely as it follows the right ones. What tells a good place from a bad one is how unusual a speaker and
+how unusual poses it takes. So this is minimised, the negative logarithm of a posterior:
+
+    J(motion, vertices, s) =
+          N * mean over frames of -log Normal(motion(q_t); v(s, p_mean), noise^2 I + D(s) Sigma_p D(s)')
+        + |s - s_mean|^2 / (2 sigma_s^2)
+        + |motion - guess|^2 / (2 sd^2)
+        + (place of the tip coil - usual)^2 / (2 sd^2)    mm along the contour: coils can slide, and the motion with them
+        + (height above the palate)^2 / (2 sd^2)          mean of the worst twentieth of the frames
+
+The poses are integrated out: D(s) = d v / d p at the coils, sigma_s and Sigma_p as measured on the model's training
+weights. (With the best pose instead, a larger speaker who moves less would win, however exact the coils.) The frames
+enter by their mean and covariance alone, which is why this is fast. What parts coils and vertices is mostly what the
+model cannot express, and that is the same in every frame: T frames say no more than N = T / (1 + (T - 1) r)
+independent ones, where r is the share of the noise that is not the device's own. The noise is estimated from the
+residuals, so coils that the model can express place themselves to a fraction of a millimetre, and those of a stranger
+stay near their bite plane. Scale is not fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import InputError
+from ..model.midsagittal import midsagittal_vertices, upper_surface_vertices
+from ..model.multilinear import Mode, TongueModel
+from .anatomy import SpeakerEstimator
+from .coilmap import LATERAL_ROLES, TONGUE_ROLES
+from .correspondences import Correspondences, Places, complete_frames, slid_along_contour
+from .palate import Palate
+from .pose import FloatArray
+from .session import Energy
+
+SHOWN_FRAMES = 120  # spread through the recording: for the palate, and for the speaker that is told
+MOST_INDEPENDENT = 1000  # frames; a recording has more only on paper
+# Where coils usually sit: mm behind the front end of the contour. Only the tip's place is believed, within its sd.
+USUAL_PLACES_MM = dict(zip(TONGUE_ROLES[4], (10.0, 27.0, 45.0, 58.0), strict=True))
+TIP_PLACE_SD_MM = 4.0
+ASIDE_SD_MM = 1.0  # of the vertex of a mid-sagittal coil from the plane
+STARTS_MM = (-4.0, 0.0, 4.0)  # along the contour, from the usual place
+LANDMARK_SD_MM = 6.0  # how far the mean tongue's landmarks are from a speaker's own
+MODEL_NOISE_MM = 1.0  # what parts a real speaker and the model at the coils; the most that is believed
+DEVICE_NOISE_MM = 0.3  # of a coordinate; what is less does not repeat from frame to frame
+NOISES_MM = np.geomspace(0.1, MODEL_NOISE_MM, 25)
+OUTLIER_MEDIANS = 6.0
+PALATE_SD_MM = 0.5
+WORST_SHARE = 0.05  # of the frames, for the palate's bound
+ROUGH_ROUNDS, ROUNDS = 2, 15
+FINISHED_ENDS = 2
+ADAPTATIONS = 4  # between two slides along the contour
+COOLING = 0.6  # by which the noise may fall between two slides: with less noise, places are harder to leave
+TRIAL_STEPS = 12  # of a descent that only compares places
+UNITS = (2.0, 0.05)  # mm and radians of one step of the search
+DIFFERENCE = 1e-5
+FAR_FROM_GUESS = 2.5  # standard deviations
+
+
+@dataclass(frozen=True)
+class FirstGuess:
+    """Where the coils are believed to be: model = rotation @ coil + translation.
+
+    rotation: (3, 3); translation_mm: (3,); translation_sd_mm, rotation_sd_deg: how far it may be wrong, per axis, at
+    the tongue (a bite plane: about 3 mm and 4 degrees; axes alone: tens of mm). source: for people.
+    """
+
+    rotation: FloatArray
+    translation_mm: FloatArray
+    translation_sd_mm: float
+    rotation_sd_deg: float
+    source: str
+
+    def __post_init__(self) -> None:
+        if not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6):
+            raise InputError(f"{self.source}: the first guess's rotation is not orthonormal.")
+        if not (self.translation_sd_mm > 0 and self.rotation_sd_deg > 0):
+            raise InputError(
+                f"{self.source}: a first guess may be wrong by {self.translation_sd_mm:g} mm and "
+                f"{self.rotation_sd_deg:g} degrees; both need to be above 0."
+            )
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A rigid alignment with what it rests on.
+
+    rotation (3, 3), translation_mm (3,): model = rotation @ coil + translation, of the coils as they were given.
+    correspondences: roles, vertices and mean distances, in the coils' order.
+    speaker_weights: (m,) raw, the joint estimate over the sampled frames with the tracker's energy.
+    residual_before_mm, residual_mm: mean distance of coils from vertices for that estimate, at the first guess and
+    now, with the same vertices. sure: (3,) for mid-sagittal coils: sd of y, z in mm and of the pitch in degrees; else
+    (6,): of x, y, z in mm and of the rotations about x, y, z in degrees; from the curvature of J.
+    posterior: J. noise_mm: what it took for the model's misfit. palate_margin_mm: by how much the contour is above
+    the palate in the highest 1 % of the sampled frames (negative: below); NaN without a palate.
+    sentences: for people.
+    """
+
+    rotation: FloatArray
+    translation_mm: FloatArray
+    correspondences: Correspondences
+    speaker_weights: FloatArray
+    residual_before_mm: float
+    residual_mm: float
+    sure: FloatArray
+    posterior: float
+    noise_mm: float
+    palate_margin_mm: float
+    sentences: tuple[str, ...]
+
+    @property
+    def vertices(self) -> tuple[int, ...]:
+        return self.correspondences.vertices
+
+
+@dataclass(frozen=True)
+class Handedness:
+    """How the coils fit as they are, and with axes turned round: J and residual in mm for each.
+
+    turned: "as it is", "front and back exchanged", "up and down exchanged", "both exchanged"; the middle two are
+    mirror images, the last is half a turn. Nothing is applied.
+    """
+
+    turned: tuple[str, ...]
+    posteriors: tuple[float, ...]
+    residuals_mm: tuple[float, ...]
+
+    @property
+    def best(self) -> str:
+        return self.turned[int(np.argmin(self.posteriors))]
+
+    @property
+    def mirrored(self) -> bool:
+        return int(np.argmin(self.posteriors)) in (1, 2)
+
+    def __str__(self) -> str:
+        each = ", ".join(
+            f"{name} {residual:.2f} mm (cost {cost:.0f})"
+            for name, residual, cost in zip(self.turned, self.residuals_mm, self.posteriors, strict=True)
+        )
+        if self.best == self.turned[0]:
+            return f"the coils fit best as they are: {each}"
+        kind = "a mirror image" if self.mirrored else "half a turn"
+        return f"the coils would fit better with {self.best}, {kind}; check the axes: {each}"
+
+
+# Names as in `Handedness.turned`: signs of y and z.
+_TURNS = {
+    "as it is": (1.0, 1.0),
+    "front and back exchanged": (-1.0, 1.0),
+    "up and down exchanged": (1.0, -1.0),
+    "both exchanged": (-1.0, -1.0),
+}
+
+
+def fit_alignment(
+    model: TongueModel,
+    coils: FloatArray,
+    roles: Sequence[str],
+    guess: FirstGuess,
+    energy: Energy,
+    palate: Palate | None = None,
+    midsagittal: bool = True,
+) -> Registration:
+    """The rigid motion, the correspondences and the speaker that explain the coils together.
+
+    coils: (frames, n, 3) mm, smoothed and head-corrected, NaN = missing; roles: (n,); palate: in the coils' frame,
+    whose axes have the model's directions up to the guess. midsagittal: the motion stays in the mid-sagittal plane
+    (y, z, pitch) and x is set to 0 afterwards, as the paper does; False: all six parameters. Mid-sagittal coils keep
+    the order of their roles along the contour. Deterministic.
+
+    Raises InputError where no frame has all coils, or the model too few vertices for them.
+    """
+    frames = np.asarray(coils[complete_frames(coils)], dtype=np.float64)
+    posterior, found = _settled(lambda: _Posterior(model, frames, roles, guess, palate, midsagittal))
+    sure = posterior.standard_deviations(found)
+
+    vertices = tuple(int(posterior.candidates[place]) for place in found.places)
+    at_coils = model.at(vertices)
+    placed = posterior.moved(found.unknowns)
+    estimator = SpeakerEstimator(at_coils, energy, len(placed))
+    before = estimator.estimate(posterior.moved(np.zeros(len(found.unknowns))), None, True)
+    speaker = estimator.estimate(placed, None, True)
+    assert before is not None and speaker is not None
+    distances = np.linalg.norm(_shapes(at_coils, speaker.weights, estimator.poses) - placed, axis=2)
+    correspondences = Correspondences(
+        tuple(roles), vertices, tuple(float(one) for one in distances.mean(axis=0))
+    )
+    rotation, translation = posterior.whole_motion(found.unknowns)
+    margin = np.nan
+    if palate is not None:
+        contour = model.at([int(vertex) for vertex in midsagittal_vertices(model)])
+        contours = _shapes(contour, speaker.weights, estimator.poses)
+        margin = float(np.quantile(posterior.heights(contours, found.unknowns), 0.99))
+    registration = Registration(
+        rotation, translation, correspondences, speaker.weights, before.residual_mm, speaker.residual_mm, sure,
+        found.value, posterior.noise_mm, margin, (),
+    )  # fmt: skip
+    return replace(registration, sentences=_sentences(registration, posterior, found.unknowns, guess))
+
+
+def handedness(
+    model: TongueModel,
+    coils: FloatArray,
+    roles: Sequence[str],
+    guess: FirstGuess,
+    energy: Energy,
+) -> Handedness:
+    """Whether mid-sagittal coils (frames, n, 3) mm are mirrored or upside down: a registration of each possibility.
+
+    A tongue is rounded upwards and its tip is in front, so the coils tell, as long as they are not in one line. What
+    they cannot tell is left from right. For the caller to show; nothing is applied.
+    """
+    frames = coils[complete_frames(coils)] @ guess.rotation.T + guess.translation_mm
+    centre = np.median(frames, axis=(0, 1))
+    here = replace(guess, rotation=np.eye(3), translation_mm=np.zeros(3))
+    costs, residuals = [], []
+    for signs in _TURNS.values():
+        turned = (frames - centre) * [1.0, *signs] + centre
+        posterior = _Posterior(model, turned, roles, here, None, True)
+        found = _rough_ends(posterior)[0]
+        placed = posterior.moved(found.unknowns)
+        vertices = [int(posterior.candidates[place]) for place in found.places]
+        estimate = SpeakerEstimator(model.at(vertices), energy, len(placed)).estimate(placed, None, True)
+        assert estimate is not None
+        costs.append(found.value)
+        residuals.append(estimate.residual_mm)
+    return Handedness(tuple(_TURNS), tuple(costs), tuple(residuals))
+
+
+def _rough_ends(posterior: _Posterior) -> list[_Found]:
+    """The ends from all starts with the first noise, the best one first, each set of places once."""
+    ends = [
+        posterior.settle(posterior.begin(places), places, ROUGH_ROUNDS, adaptive=False)
+        for places in posterior.first_places()
+    ]
+    ends.sort(key=lambda end: end.value)
+    return [end for index, end in enumerate(ends) if end.places not in [one.places for one in ends[:index]]]
+
+
+def _settled(posterior: Callable[[], _Posterior]) -> tuple[_Posterior, _Found]:
+    """The best of the ends that are reached from the best rough ones, with the posterior as it was left there."""
+    settled = []
+    for rough in _rough_ends(posterior())[:FINISHED_ENDS]:
+        own = posterior()
+        settled.append((own, own.settle(rough.unknowns, rough.places, ROUNDS, adaptive=True)))
+    noise = max(own.noise_mm for own, _ in settled)  # J is only comparable with the same noise
+    return min(settled, key=lambda one: one[0].value(one[1].unknowns, one[1].places, noise))
+
+
+@dataclass(frozen=True)
+class _Found:
+    """An end of the search. unknowns: motion, then the speaker in measured sigma; value: J there."""
+
+    unknowns: FloatArray
+    places: Places
+    value: float
+
+
+class _Posterior:
+    """J of the module's docstring as a function of motion, speaker and the places of the coils.
+
+    A motion is (y, z, pitch) or (x, y, z, rotation vector), mm and radians, about the middle of the coils as the
+    guess has them. A place is an index into `candidates`: the contour's vertices from tip to root, then, for lateral
+    coils, those of the upper surface.
+    """
+
+    def __init__(
+        self,
+        model: TongueModel,
+        frames: FloatArray,
+        roles: Sequence[str],
+        guess: FirstGuess,
+        palate: Palate | None,
+        midsagittal: bool,
+    ) -> None:
+        self._guess = guess
+        self._palate = palate
+        self._midsagittal = midsagittal
+        self._coils = frames @ guess.rotation.T + guess.translation_mm
+        self._centre = np.median(self._coils, axis=(0, 1))
+        self._roles = tuple(roles)
+        self._lateral = [index for index, role in enumerate(roles) if role in LATERAL_ROLES]
+        self._middle = [index for index in range(len(roles)) if index not in self._lateral]
+        if all(roles[index] in TONGUE_ROLES[4] for index in self._middle):
+            self._middle.sort(key=lambda index: TONGUE_ROLES[4].index(roles[index]))
+        contour = midsagittal_vertices(model)
+        if len(contour) < len(self._middle):
+            raise InputError(
+                f"the model '{model.name}' has {len(contour)} vertices of its upper surface near the plane x = 0, too "
+                f"few for {len(self._middle)} coils."
+            )
+        self._contour_size = len(contour)
+        surface = upper_surface_vertices(model) if self._lateral else np.zeros(0, dtype=np.intp)
+        self.candidates: NDArray[np.intp] = np.concatenate([contour, surface])
+        self._model = model.at([int(vertex) for vertex in self.candidates])
+        self._contour = self._model.at(range(len(contour)))
+        self._surface = self._model.at(range(len(contour), len(self.candidates)))
+        self._mean = self._model.mean_vertices()
+        steps = np.linalg.norm(np.diff(self._mean[: len(contour), 1:], axis=0), axis=1)
+        self._along = np.concatenate([[0.0], np.cumsum(steps)])
+        self._speaker_sd, pose_sd = (_measured_sigma(mode) for mode in (model.speaker, model.pose))
+        self._pose_mean = model.pose.mean
+        self._pose_covariance = np.diag(pose_sd**2)
+        self.size = 3 if midsagittal else 6
+        self._shifts = 2 if midsagittal else 3  # the rest of the motion turns
+        turns = self.size - self._shifts
+        self._units = np.array([UNITS[0]] * self._shifts + [UNITS[1]] * turns + [1.0] * model.speaker.size)
+        self._sd = np.array(
+            [guess.translation_sd_mm] * self._shifts + [np.radians(guess.rotation_sd_deg)] * turns
+        )
+        # The axes that are measured: across the plane, projected coils say nothing.
+        self._axes = np.flatnonzero(np.tile([not midsagittal, True, True], len(roles)))
+        self.noise_mm = MODEL_NOISE_MM
+        self._summarise(_near_their_medians(self._coils))
+
+    def _summarise(self, kept: NDArray[np.bool_]) -> None:
+        """The frames that count, as their mean (3n,) and covariance (3n, 3n), and some of them for the palate."""
+        flat = self._coils[kept].reshape(int(kept.sum()), -1)
+        self._frames = len(flat)
+        self._middle_of_frames = flat.mean(axis=0)
+        self._spread = np.cov(flat.T, bias=True) if len(flat) > 1 else np.zeros((flat.shape[1],) * 2)
+        self.shown = _evenly(flat.reshape(len(flat), -1, 3), SHOWN_FRAMES)
+
+    # Where to begin ---------------------------------------------------------------------------------
+
+    def first_places(self) -> list[Places]:
+        """Landmarks: the coils as far apart along the mean contour as they are in the data, from several places of
+        the first."""
+        gaps = np.linalg.norm(np.diff(self._coils[:, self._middle], axis=1), axis=2)
+        apart = np.concatenate([[0.0], np.cumsum(np.median(gaps, axis=0))])
+        aside = np.abs(self._mean[: self._contour_size, 0])
+        usual = USUAL_PLACES_MM["tongue_tip"]
+        if self._middle:
+            usual = USUAL_PLACES_MM.get(self._roles[self._middle[0]], usual)
+        found = []
+        for start in STARTS_MM:
+            places = np.zeros(len(self._roles), dtype=np.intp)
+            least = 0
+            for order, index in enumerate(self._middle):
+                miss = np.abs(self._along - (usual + start + apart[order])) + aside
+                most = self._contour_size - (len(self._middle) - order)
+                places[index] = least + int(np.argmin(miss[least : most + 1]))
+                least = int(places[index]) + 1
+            for index in self._lateral:
+                surface = self._mean[self._contour_size :]
+                coil = np.median(self._coils[:, index], axis=0)
+                same_side = surface[:, 0] * (coil[0] - self._centre[0]) > 0
+                away = np.linalg.norm(surface - coil, axis=1)
+                places[index] = self._contour_size + int(np.argmin(np.where(same_side, away, np.inf)))
+            found.append(tuple(int(place) for place in places))
+        return found
+
+    def begin(self, places: Places) -> FloatArray:
+        """The mean speaker, moved from the coils' middle to that of their landmarks, as far as the guess may be
+        wrong."""
+        share = self._guess.translation_sd_mm**2 / (self._guess.translation_sd_mm**2 + LANDMARK_SD_MM**2)
+        shift = share * (self._mean[list(places)] - np.median(self._coils, axis=0)).mean(axis=0)
+        unknowns = np.zeros(len(self._units))
+        unknowns[: self._shifts] = shift[-self._shifts :]
+        return unknowns
+
+    # The motion -------------------------------------------------------------------------------------
+
+    def _rigid(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotation and translation from the guess's frame to the model's."""
+        from scipy.spatial.transform import Rotation
+
+        turn = np.zeros(3)
+        turn[: self.size - self._shifts] = unknowns[self._shifts : self.size]
+        shift = np.zeros(3)
+        shift[-self._shifts :] = unknowns[: self._shifts]
+        rotation = np.asarray(Rotation.from_rotvec(turn).as_matrix())
+        return rotation, self._centre - rotation @ self._centre + shift
+
+    def whole_motion(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotation (3, 3) and translation (3,) from the coils as they were given to the model's frame."""
+        rotation, translation = self._rigid(unknowns)
+        return rotation @ self._guess.rotation, rotation @ self._guess.translation_mm + translation
+
+    def moved(self, unknowns: FloatArray) -> FloatArray:
+        """(T, n, 3) the shown frames in the model's frame."""
+        rotation, translation = self._rigid(unknowns)
+        there = self.shown @ rotation.T + translation
+        if self._midsagittal:
+            there[:, :, 0] = 0.0
+        return np.ascontiguousarray(there)
+
+    # J ----------------------------------------------------------------------------------------------
+
+    @property
+    def _independent_frames(self) -> float:
+        """N: how many independent frames those of the recording are worth."""
+        frames = min(self._frames, MOST_INDEPENDENT)
+        repeated = 1.0 - min(DEVICE_NOISE_MM / self.noise_mm, 1.0) ** 2
+        return frames / (1.0 + (frames - 1) * repeated)
+
+    def speaker(self, unknowns: FloatArray) -> FloatArray:
+        """(m,) raw weights."""
+        return np.asarray(self._model.speaker.mean + self._speaker_sd * unknowns[self.size :])
+
+    def value(self, unknowns: FloatArray, places: Places, noise_mm: float) -> float:
+        """J with another noise."""
+        own, self.noise_mm = self.noise_mm, noise_mm
+        value = self._value_and_slope(unknowns, self._model.at(places), places)[0]
+        self.noise_mm = own
+        return value
+
+    def _value_and_slope(
+        self, unknowns: FloatArray, at_coils: TongueModel, places: Places
+    ) -> tuple[float, FloatArray]:
+        """J, and its derivatives in the speaker (in measured sigma), without the palate's."""
+        frame = self._frame_terms(unknowns, at_coils, self.noise_mm)
+        speaker = unknowns[self.size :]
+        value = self._independent_frames * frame.value + 0.5 * float(speaker @ speaker)
+        value += 0.5 * float(np.sum((unknowns[: self.size] / self._sd) ** 2))
+        for index in self._middle:
+            value += 0.5 * float(self._mean[places[index], 0] ** 2) / ASIDE_SD_MM**2
+            if self._roles[index] == "tongue_tip":
+                slid = self._along[places[index]] - USUAL_PLACES_MM["tongue_tip"]
+                value += 0.5 * (slid / TIP_PLACE_SD_MM) ** 2
+        if self._palate is not None:
+            worst = np.sort(self._heights(unknowns, frame))[-max(1, round(WORST_SHARE * len(self.shown))) :]
+            value += 0.5 * (float(np.maximum(worst, 0.0).mean()) / PALATE_SD_MM) ** 2
+        return value, self._independent_frames * frame.slope * self._speaker_sd + speaker
+
+    def _frame_terms(self, unknowns: FloatArray, at_coils: TongueModel, noise_mm: float) -> _FrameTerms:
+        """The mean over the frames of their negative log likelihood, up to a constant."""
+        rotation, translation = self._rigid(unknowns)
+        turned = np.kron(np.eye(len(self._roles)), rotation)
+        middle = (turned @ self._middle_of_frames + np.tile(translation, len(self._roles)))[self._axes]
+        spread = (turned @ self._spread @ turned.T)[np.ix_(self._axes, self._axes)]
+        core = at_coils.core[:, :, self._axes]
+        directions = np.tensordot(self.speaker(unknowns), core, axes=1)  # (n, axes)
+        answering = self._pose_covariance @ directions
+        off = middle - at_coils.origin[self._axes] - self._pose_mean @ directions
+        expected = directions.T @ answering + noise_mm**2 * np.eye(len(off))
+        inverse = np.linalg.inv(expected)
+        pull = inverse @ off
+        value = 0.5 * float(np.sum(inverse * spread) + off @ pull + np.linalg.slogdet(expected)[1])
+        narrower = inverse - inverse @ spread @ inverse - np.outer(pull, pull)
+        by_direction = answering @ narrower - np.outer(self._pose_mean, pull)
+        gain = answering @ inverse  # pose = mean + gain @ (coils - expected)
+        return _FrameTerms(
+            value, np.tensordot(core, by_direction, axes=2), off - middle, gain, inverse, directions
+        )
+
+    def _poses(self, unknowns: FloatArray, frame: _FrameTerms) -> FloatArray:
+        """(T, n) the poses of the shown frames that the coils make most probable."""
+        coils = self.moved(unknowns).reshape(len(self.shown), -1)[:, self._axes]
+        return np.asarray(self._pose_mean + (coils + frame.off) @ frame.gain.T)
+
+    def _heights(self, unknowns: FloatArray, frame: _FrameTerms) -> FloatArray:
+        contours = _shapes(self._contour, self.speaker(unknowns), self._poses(unknowns, frame))
+        return self.heights(contours, unknowns)
+
+    def heights(self, contours: FloatArray, unknowns: FloatArray) -> FloatArray:
+        """(T,) mm by which contours (T, c, 3) rise above the palate at the most; minus infinity without overlap."""
+        assert self._palate is not None
+        rotation, translation = self.whole_motion(unknowns)
+        above = self._palate.above((contours - translation) @ rotation)
+        return np.asarray(np.where(np.isnan(above), -np.inf, above).max(axis=1))
+
+    # Its minimum ------------------------------------------------------------------------------------
+
+    def settle(self, unknowns: FloatArray, places: Places, rounds: int, adaptive: bool) -> _Found:
+        """Unknowns and places in turn, until neither changes; adaptive: the noise and which frames count too."""
+        for _ in range(rounds):
+            noise = self.noise_mm
+            for _ in range(ADAPTATIONS if adaptive else 0):
+                unknowns, _ = self._descend(unknowns, places)
+                self._adapt(unknowns, places, COOLING * noise)
+            unknowns, _ = self._descend(unknowns, places)
+            found = self._slid(unknowns, places)
+            if found == places and noise == self.noise_mm:
+                break
+            places = found
+        unknowns, value = self._descend(unknowns, places)
+        return _Found(unknowns, places, value)
+
+    def _descend(
+        self, unknowns: FloatArray, places: Places, steps: int = 60, scaling: FloatArray | None = None
+    ) -> tuple[FloatArray, float]:
+        """BFGS; the speaker's derivatives are exact unless the palate has a say, the motion's by differences.
+
+        scaling: (k, k), J is about round in scaling^-1 @ unknowns; None where that is not known yet.
+        """
+        from scipy.optimize import minimize
+
+        scaling = np.diag(self._units) if scaling is None else scaling
+        at_coils = self._model.at(places)
+        by_differences = self.size if self._palate is None else len(unknowns)
+
+        def value_and_slope(scaled: FloatArray) -> tuple[float, FloatArray]:
+            here = unknowns + scaling @ scaled
+            value, speaker_slope = self._value_and_slope(here, at_coils, places)
+            slope = np.concatenate([np.zeros(self.size), speaker_slope])
+            for index in range(by_differences):
+                there = here.copy()
+                step = DIFFERENCE * self._units[index]
+                there[index] += step
+                slope[index] = (self._value_and_slope(there, at_coils, places)[0] - value) / step
+            return value, scaling.T @ slope
+
+        end = minimize(
+            value_and_slope,
+            np.zeros(len(unknowns)),
+            jac=True,
+            method="BFGS",
+            options={"gtol": 1e-3, "maxiter": steps},
+        )
+        return np.asarray(unknowns + scaling @ end.x), float(end.fun)
+
+    def _slid(self, unknowns: FloatArray, places: Places) -> Places:
+        """The places after sliding coils along the contour; motion and speaker follow each trial."""
+        known: dict[Places, float] = {}
+        scaling = np.linalg.cholesky(self._covariance(unknowns, places))
+
+        def cost(trial: Places) -> float:
+            if trial not in known:
+                known[trial] = self._descend(unknowns, trial, TRIAL_STEPS, scaling)[1]
+            return known[trial]
+
+        places = slid_along_contour(places, self._middle, self._contour_size, cost)
+        for stride in (4, 2, 1, 1):
+            together = (self._all_slid(places, move) for move in (-stride, stride))
+            places = min((places, *(one for one in together if one is not None)), key=cost)
+        for index in self._lateral:
+            trial = list(places)
+            trial[index] = self._nearest_on_surface(unknowns, places, index)
+            if cost(tuple(trial)) < cost(places):
+                places = tuple(trial)
+        return places
+
+    def _all_slid(self, places: Places, move: int) -> Places | None:
+        """All mid-sagittal coils together, as a wrong motion along the tongue has them; None beyond the contour."""
+        trial = list(places)
+        for index in self._middle:
+            trial[index] += move
+        inside = all(0 <= trial[index] < self._contour_size for index in self._middle)
+        return tuple(trial) if inside else None
+
+    def _nearest_on_surface(self, unknowns: FloatArray, places: Places, index: int) -> int:
+        """The place on the upper surface that is nearest to a lateral coil on average over the frames."""
+        frame = self._frame_terms(unknowns, self._model.at(places), self.noise_mm)
+        shapes = _shapes(self._surface, self.speaker(unknowns), self._poses(unknowns, frame))
+        apart = np.linalg.norm(shapes - self.moved(unknowns)[:, index][:, None], axis=2)
+        return self._contour_size + int(np.argmin(apart.mean(axis=0)))
+
+    def _adapt(self, unknowns: FloatArray, places: Places, least_noise_mm: float) -> None:
+        """The frames that are no outliers, their poses, and the noise that makes them most probable."""
+        at_coils = self._model.at(places)
+        frame = self._frame_terms(unknowns, at_coils, self.noise_mm)
+        rotation, translation = self._rigid(unknowns)
+        off = (self._coils @ rotation.T + translation).reshape(len(self._coils), -1)[
+            :, self._axes
+        ] + frame.off
+        unlikely = np.einsum("ta,ab,tb->t", off, frame.inverse, off)
+        kept = unlikely <= OUTLIER_MEDIANS * np.median(unlikely)
+        self._summarise(kept)
+        # The recording's own poses count beside those of the model's training by how many they are.
+        training = self._model.pose
+        own = self._independent_frames / (self._independent_frames + training.entries)
+        poses = self._pose_mean + off[kept] @ frame.gain.T
+        unsure = self._pose_covariance - frame.gain @ frame.directions.T @ self._pose_covariance
+        mean = (1.0 - own) * training.mean + own * poses.mean(axis=0)
+        away = poses - mean
+        believed = np.diag(_measured_sigma(training) ** 2) + np.outer(
+            training.mean - mean, training.mean - mean
+        )
+        self._pose_mean = mean
+        self._pose_covariance = (1.0 - own) * believed + own * (away.T @ away / len(away) + unsure)
+        noises = NOISES_MM[NOISES_MM >= least_noise_mm]
+        likely = [self._frame_terms(unknowns, at_coils, noise).value for noise in noises]
+        self.noise_mm = float(noises[int(np.argmin(likely))])
+
+    def _covariance(self, unknowns: FloatArray, places: Places) -> FloatArray:
+        """(k, k) of the unknowns, from the curvature of J there; the vertices are held."""
+        step = 0.1
+        size = len(self._units)
+        at_coils = self._model.at(places)
+
+        def at(*moves: tuple[int, float]) -> float:
+            there = unknowns.copy()
+            for index, by in moves:
+                there[index] += by * step * self._units[index]
+            return self._value_and_slope(there, at_coils, places)[0]
+
+        middle = at()
+        curvature = np.zeros((size, size))
+        for a in range(size):
+            curvature[a, a] = (at((a, 1)) - 2 * middle + at((a, -1))) / step**2
+            for b in range(a):
+                mixed = at((a, 1), (b, 1)) - at((a, 1), (b, -1)) - at((a, -1), (b, 1)) + at((a, -1), (b, -1))
+                curvature[a, b] = curvature[b, a] = mixed / (4 * step**2)
+        # The priors alone make every direction at least this curved; kinks of the palate must not undo that.
+        values, vectors = np.linalg.eigh(curvature)
+        least = float(min(1.0, np.min((self._units[: self.size] / self._sd) ** 2)))
+        covariance = vectors @ np.diag(1.0 / np.maximum(values, least)) @ vectors.T
+        return np.asarray(covariance * np.outer(self._units, self._units))
+
+    def standard_deviations(self, found: _Found) -> FloatArray:
+        """(3,) or (6,) of the motion, mm and degrees; the speaker is not held."""
+        deviations = np.sqrt(np.diag(self._covariance(found.unknowns, found.places)))[: self.size]
+        deviations[self._shifts :] = np.degrees(deviations[self._shifts :])
+        return np.asarray(deviations)
+
+    def deviations_from_guess(self, unknowns: FloatArray) -> FloatArray:
+        """The motion in standard deviations of the guess."""
+        return np.asarray(unknowns[: self.size] / self._sd)
+
+
+class _FrameTerms(NamedTuple):
+    """value: of the mean frame; slope: (m,) its derivatives in the raw speaker weights; off: (axes,) to be added to
+    coils for their deviation from what is expected; gain: (n, axes) of the pose; inverse: (axes, axes) of the
+    expected covariance; directions: (n, axes) d v / d p."""
+
+    value: float
+    slope: FloatArray
+    off: FloatArray
+    gain: FloatArray
+    inverse: FloatArray
+    directions: FloatArray
+
+
+def _measured_sigma(mode: Mode) -> FloatArray:
+    """The deviation of each weight over the training entries. The published sigma is the same for all weights, but
+    the one that carries the mean is really 4 to 18 times stiffer."""
+    return mode.sigma if mode.measured_sigma is None else np.maximum(mode.measured_sigma, 1e-6)
+
+
+def _shapes(model: TongueModel, speaker: FloatArray, poses: FloatArray) -> FloatArray:
+    """(T, V, 3) mm: the model's vertices for one speaker (m,) in the poses (T, n)."""
+    directions = np.tensordot(speaker, model.core, axes=1)
+    return np.asarray((model.origin + poses @ directions).reshape(len(poses), -1, 3))
+
+
+def _near_their_medians(coils: FloatArray) -> NDArray[np.bool_]:
+    """(frames,) whether no coil of (frames, n, 3) is far outside its usual range."""
+    away = np.linalg.norm(coils - np.median(coils, axis=0), axis=2)
+    return np.asarray((away <= OUTLIER_MEDIANS * np.maximum(np.median(away, axis=0), 1.0)).all(axis=1))
+
+
+def _evenly(frames: FloatArray, most: int) -> FloatArray:
+    """At most so many frames, spread through all of them."""
+    return frames[np.unique(np.linspace(0, len(frames) - 1, most).astype(int))]
+
+
+def _sentences(
+    found: Registration, posterior: _Posterior, motion: FloatArray, guess: FirstGuess
+) -> tuple[str, ...]:
+    names = ("y", "z") if posterior.size == 3 else ("x", "y", "z")
+    turns = ("pitch",) if posterior.size == 3 else ("about x", "about y", "about z")
+    shifts = motion[: len(names)]
+    angles = np.degrees(motion[len(names) : posterior.size])
+    moved = ", ".join(
+        [f"{n} {v:+.1f} +- {s:.1f} mm" for n, v, s in zip(names, shifts, found.sure, strict=False)]
+        + [
+            f"{n} {v:+.1f} +- {s:.1f} degrees"
+            for n, v, s in zip(turns, angles, found.sure[len(names) :], strict=True)
+        ]
+    )
+    told = [
+        f"alignment (fitted to the model, from {guess.source}): {moved}, about the middle of the coils",
+        (
+            f"residual of the jointly estimated speaker: {found.residual_mm:.2f} mm; before the fit, with the same "
+            f"vertices, {found.residual_before_mm:.2f} mm"
+        ),
+        f"correspondences (fitted with the alignment): {found.correspondences}",
+    ]
+    worst = float(np.abs(posterior.deviations_from_guess(motion)).max())
+    if worst > FAR_FROM_GUESS:
+        told.append(
+            f"note: the fit is {worst:.1f} standard deviations away from {guess.source}; look at the contours before "
+            "it is believed"
+        )
+    if np.isfinite(found.palate_margin_mm):
+        where = "above" if found.palate_margin_mm > 0 else "below"
+        told.append(
+            f"palate: in 99 % of the sampled frames the contour stays {abs(found.palate_margin_mm):.1f} mm {where} it "
+            "or lower"
+        )
+    return tuple(told)
