@@ -14,7 +14,21 @@ EXIT_BAD_INPUT = 2
 
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line as an argparse parser."""
-    from . import bench, demo, devices, doctor, evaluate, files, live, model, monitor, simulate, take, track
+    from . import (
+        bench,
+        calibrate,
+        demo,
+        devices,
+        doctor,
+        evaluate,
+        files,
+        live,
+        model,
+        monitor,
+        simulate,
+        take,
+        track,
+    )
 
     parser = argparse.ArgumentParser(
         prog="tonguetrack",
@@ -22,7 +36,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"tonguetrack {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for family in (demo, live, track, files, take, devices, doctor, model, evaluate, simulate, monitor, bench):
+    for family in (
+        demo, live, track, calibrate, files, take, devices, doctor, model, evaluate, simulate, monitor, bench,
+    ):  # fmt: skip
         family.add_commands(commands)
     return parser
 
