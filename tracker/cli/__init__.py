@@ -21,6 +21,7 @@ def build_parser() -> argparse.ArgumentParser:
         devices,
         doctor,
         evaluate,
+        experiment,
         files,
         live,
         model,
@@ -37,7 +38,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"tonguetrack {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for family in (
-        demo, live, track, calibrate, files, take, devices, doctor, model, evaluate, simulate, monitor, bench,
+        demo, live, track, calibrate, files, take, devices, doctor, model, evaluate, experiment, simulate, monitor, bench,
     ):  # fmt: skip
         family.add_commands(commands)
     return parser
