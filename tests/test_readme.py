@@ -404,6 +404,35 @@ def test_the_readmes_two_commands_for_a_wave(newcomer):
     typed(f"{tool()} take info take.xdf --check", newcomer)
 
 
+@pytest.mark.parametrize(
+    ("device", "words", "usual"),
+    [
+        ("ndi --from recordings/demo.csv --rfc2217", "ndi+rfc2217", "ndi+rfc2217://127.0.0.1:8765"),
+        (
+            "carstens --from recordings/demo.csv --layout ag501",
+            "carstens",
+            "carstens://127.0.0.1:30303?layout=ag501",
+        ),
+    ],
+)
+def test_the_docs_commands_for_simulated_devices(newcomer, device, words, usual):
+    """On a free port, for a second."""
+    (command,) = [
+        command for command in DOCS if command.startswith(".venv/bin/tonguetrack live") and words in command
+    ]
+    with subprocess.Popen(
+        [tool(), "simulate", "device", *device.split(), "--port", "0"],
+        cwd=newcomer, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    ) as simulator:  # fmt: skip
+        try:
+            assert simulator.stdout is not None
+            address = simulator.stdout.readline().strip()
+            assert usual in command
+            typed(command.replace(usual, address) + " --seconds 1", newcomer)
+        finally:
+            simulator.terminate()
+
+
 def test_the_docs_quote_what_model_info_prints(tmp_path):
     (tmp_path / ".venv" / "bin").mkdir(parents=True)
     (tmp_path / ".venv" / "bin" / "tonguetrack").symlink_to(tool())
