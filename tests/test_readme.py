@@ -61,6 +61,14 @@ README = {
 }
 
 DOCS = {
+    (
+        '.venv/bin/tonguetrack live ndi+rfc2217://127.0.0.1:8765 --coils "port 1=tongue_tip,port 1b=tongue_blade,'
+        'port 2=tongue_dorsum"'
+    ): ELSEWHERE + "test_the_docs_commands_for_simulated_devices",
+    (
+        '.venv/bin/tonguetrack live "carstens://127.0.0.1:30303?layout=ag501" --coils '
+        "Ch1=tongue_tip,Ch2=tongue_blade,Ch3=tongue_dorsum"
+    ): ELSEWHERE + "test_the_docs_commands_for_simulated_devices",
     FIRST_TAKE: HERE,
     ".venv/bin/tonguetrack doctor": ELSEWHERE + "test_doctor.py, where what is found may be anything",
     ".venv/bin/tonguetrack devices": HERE,
