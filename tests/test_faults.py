@@ -323,7 +323,7 @@ def test_other_coils_after_a_new_connection_are_refused_in_a_sentence(hurried):
 
 
 def test_a_first_connection_that_fails_is_bad_input():
-    with pytest.raises(InputError, match=r"device: nobody answers; is the device on"):
+    with pytest.raises(InputError, match="nobody answers; is the device on, and is device its address"):
         source_of(LinkLost("nobody answers"))
     with pytest.raises(InputError, match="wrong option"):
         source_of(InputError("wrong option"))

@@ -25,11 +25,19 @@ from hypothesis import HealthCheck, Verbosity, given, settings
 
 from tonguetrack import InputError
 from tonguetrack.drivers import CoilFrame, Recording, SourceNote
-from tonguetrack.drivers.devices import authors_live, carstens_live, lsl_source, ndi, rtc3d
+from tonguetrack.drivers.devices import (
+    authors_live,
+    carstens_live,
+    lsl_source,
+    ndi,
+    ndi_reader,
+    ndi_tracking,
+    rtc3d,
+)
 from tonguetrack.drivers.devices.carstens_source import CarstensConversation, shake_hands
 from tonguetrack.drivers.devices.link import LinkLost
-from tonguetrack.drivers.devices.ndi import Markers, State, ToolState, TrackingReply
 from tonguetrack.drivers.devices.ndi_source import Coil, Device, NdiConversation
+from tonguetrack.drivers.devices.ndi_tracking import Markers, State, ToolState, TrackingReply
 from tonguetrack.drivers.devices.rtc3d_source import Rtc3dConversation
 from tonguetrack.drivers.files.common import Options
 from tonguetrack.drivers.files.recognise import parse as parse_recording
@@ -319,7 +327,7 @@ def sealed_lines(data):
 def sealed_bx(data):
     """The length and both CRCs that these bytes would have as one binary reply."""
     body = data[6:-2]
-    header = ndi.BX_START + struct.pack("<H", min(len(body), 0xFFFF))
+    header = ndi_tracking.BX_START + struct.pack("<H", min(len(body), 0xFFFF))
     return header + struct.pack("<H", ndi.crc16(header)) + body + struct.pack("<H", ndi.crc16(body))
 
 
@@ -366,7 +374,7 @@ def ndi_names(example, folder):
     return 0
 
 
-def ndi_tracking(tracking):
+def ndi_tracked(tracking):
     assert len(tracking.tools) <= 255
     for tool in tracking.tools:
         assert len(tool.position) == 3 and len(tool.quaternion) == 4 and len(tool.markers.points) <= 255
@@ -374,21 +382,21 @@ def ndi_tracking(tracking):
 
 
 def ndi_tx(example, folder):
-    return ndi_tracking(ndi.parse_tx(as_text(example), example.choice))
+    return ndi_tracked(ndi_tracking.parse_tx(as_text(example), example.choice))
 
 
 def ndi_bx(example, folder):
-    return ndi_tracking(ndi.parse_bx(example.data, example.choice))
+    return ndi_tracked(ndi_tracking.parse_bx(example.data, example.choice))
 
 
 def ndi_stream(example, folder):
-    reader = ndi.ReplyReader()
+    reader = ndi_reader.ReplyReader()
     seen = 0
     for piece in example.pieces:
         for begin in range(0, len(piece), 1 << 16):
             reader.feed(piece[begin : begin + (1 << 16)])
             while (item := reader.next()) is not None:
-                if isinstance(item, ndi.Reply):
+                if isinstance(item, ndi_reader.Reply):
                     seen += len(item.data)
                     try:
                         if not item.binary:
@@ -468,7 +476,7 @@ def ndi_simulator(example, folder):
         clock.now_s += 0.03
         for answer in device.feed(piece):
             assert len(answer.data) < 1 << 15
-            if not damaged and answer.data[:2] != ndi.BX_START:
+            if not damaged and answer.data[:2] != ndi_tracking.BX_START:
                 assert answer.data == ndi.reply(answer.data[:-5].decode("ascii"))
         device.cut()
     return len(device._line)
@@ -951,13 +959,13 @@ PARSERS = (
     Parser("NDI: VER and GET", seeds(GET.encode(), b"a=b"), ndi_names, NDI_TOO, words=(VER.encode(), b":", b"=", b"\n")),
     Parser(
         "NDI: TX",
-        tuple(Seed(ndi.encode_tx(tracked(options), options).encode(), options) for options in EVERY_OPTION)
+        tuple(Seed(ndi_tracking.encode_tx(tracked(options), options).encode(), options) for options in EVERY_OPTION)
         + (Seed(REAL_TX.encode(), 1),),
         ndi_tx, NDI_TOO, quick=90, words=NDI_WORDS, choices=EVERY_OPTION,
     ),
     Parser(
         "NDI: BX",
-        tuple(Seed(ndi.encode_bx(tracked(options), options), options) for options in EVERY_OPTION)
+        tuple(Seed(ndi_tracking.encode_bx(tracked(options), options), options) for options in EVERY_OPTION)
         + tuple(Seed(data, 1) for data in REAL_BX),
         ndi_bx, NDI_TOO, quick=90, words=BX_ADDED, choices=EVERY_OPTION, seal=sealed_bx,
     ),
@@ -967,7 +975,7 @@ PARSERS = (
             REAL_BX[0] + ndi.reply(REAL_TX) + REAL_BX[1] + ndi.reply("OKAY") + ndi.error_reply(0x0C),
             ndi.reply(VER) * 3, sealed_header(b"\xc4\xa5\xff\xff") * 40 + REAL_BX[1], ndi.reply("x" * 3000),
         ),
-        ndi_stream, holds=ndi.MAX_BUFFER, quick=90, words=(*BX_ADDED, *NDI_WORDS), seal=sealed_header,
+        ndi_stream, holds=ndi_reader.MAX_BUFFER, quick=90, words=(*BX_ADDED, *NDI_WORDS), seal=sealed_header,
     ),
     Parser(
         "NDI: driver",
@@ -1188,11 +1196,11 @@ def test_a_session_with_numbers_beyond_measure_is_an_input_error_without_a_warni
 
 
 def test_the_longest_reply_may_still_lack_its_end_when_a_whole_read_follows():
-    reader = ndi.ReplyReader()
+    reader = ndi_reader.ReplyReader()
     reader.feed(sealed_header(b"\xc4\xa5\xff\xff\0\0") + bytes(0xFFFF + 1))
     assert reader.next() is None
     reader.feed(bytes(1 << 16))
-    assert reader.next() == ndi.Reply(sealed_header(b"\xc4\xa5\xff\xff\0\0") + bytes(0xFFFF + 2))
+    assert reader.next() == ndi_reader.Reply(sealed_header(b"\xc4\xa5\xff\xff\0\0") + bytes(0xFFFF + 2))
 
 
 @pytest.mark.parametrize("text", [b"x", b"OKAY", b"OKAYA896"])
@@ -1201,21 +1209,21 @@ def test_a_line_without_end_or_full_of_beginnings_is_work_in_proportion_to_its_l
     text, size, monkeypatch
 ):
     looked = []
-    good_line, not_text = ndi._good_line, ndi._NOT_TEXT
+    good_line, not_text = ndi_reader._good_line, ndi_reader._NOT_TEXT
 
     def search(buffer, begin=0):
         looked.append(len(buffer) - begin)
         return not_text.search(buffer, begin)
 
-    monkeypatch.setattr(ndi, "_good_line", lambda line: looked.append(len(line)) or good_line(line))
-    monkeypatch.setattr(ndi, "_NOT_TEXT", SimpleNamespace(search=search))
+    monkeypatch.setattr(ndi_reader, "_good_line", lambda line: looked.append(len(line)) or good_line(line))
+    monkeypatch.setattr(ndi_reader, "_NOT_TEXT", SimpleNamespace(search=search))
     data = text * (30_000 // len(text)) + b"\r" + ndi.reply("OKAY")
-    reader, found = ndi.ReplyReader(), []
+    reader, found = ndi_reader.ReplyReader(), []
     for begin in range(0, len(data), size):
         reader.feed(data[begin : begin + size])
         while (item := reader.next()) is not None:
             found.append(item)
-    assert found[-1] == ndi.Reply(ndi.reply("OKAY"))
+    assert found[-1] == ndi_reader.Reply(ndi.reply("OKAY"))
     assert sum(looked) <= 20 * len(data)
 
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tonguetrack.drivers.devices import ndi
-from tonguetrack.drivers.devices.ndi import Markers, State, ToolState, TrackingReply
+from tonguetrack.drivers.devices import ndi, ndi_reader, ndi_tracking
+from tonguetrack.drivers.devices.ndi_tracking import Markers, State, ToolState, TrackingReply
 
 TWO_MISSING = bytes.fromhex("c4a5170022e302010231000000000000000202310000000000000000" + "00b137")
 ONE_VALID = bytes.fromhex(
@@ -134,10 +134,10 @@ def test_an_error_says_what_its_number_means():
 
 
 def test_a_status_can_be_read():
-    assert ndi.status_words(0x00000171, ndi.PORT_STATUS) == (
+    assert ndi_tracking.status_words(0x00000171, ndi_tracking.PORT_STATUS) == (
         "occupied, initialised, enabled, out of volume, sensor broken"
     )
-    assert ndi.status_words(0, ndi.SYSTEM_STATUS) == ""
+    assert ndi_tracking.status_words(0, ndi_tracking.SYSTEM_STATUS) == ""
 
 
 def test_a_list_of_handles_comes_with_their_status():
@@ -179,27 +179,27 @@ def test_get_gives_its_lines_by_name():
 
 def test_tx_gives_transform_status_and_frame():
     text = "010A+08157-00068+05783+00000-004931+005713-015905+000000000003F00000018\n0030"
-    reply = ndi.parse_tx(text, ndi.TRANSFORMS)
+    reply = ndi_tracking.parse_tx(text, ndi_tracking.TRANSFORMS)
     (tool,) = reply.tools
     assert (tool.handle, tool.state, tool.port_status, tool.frame_number) == (0x0A, State.VALID, 0x3F, 0x18)
     assert tool.quaternion == pytest.approx((0.8157, -0.0068, 0.5783, 0.0))
     assert tool.position == pytest.approx((-49.31, 57.13, -159.05))
     assert tool.error == 0.0
     assert reply.system_status == 0x30
-    assert ndi.encode_tx(reply, ndi.TRANSFORMS) == text
+    assert ndi_tracking.encode_tx(reply, ndi_tracking.TRANSFORMS) == text
 
 
 def test_tx_names_the_handles_without_a_position():
     text = "030AMISSING0000007F000001DB\n0BDISABLED\n0CUNOCCUPIED\n0000"
-    reply = ndi.parse_tx(text, ndi.TRANSFORMS)
+    reply = ndi_tracking.parse_tx(text, ndi_tracking.TRANSFORMS)
     assert [tool.state for tool in reply.tools] == [State.MISSING, State.DISABLED, State.UNOCCUPIED]
     assert [tool.frame_number for tool in reply.tools] == [0x1DB, 0, 0]
     assert all(math.isnan(value) for tool in reply.tools for value in (*tool.position, *tool.quaternion))
-    assert ndi.encode_tx(reply, ndi.TRANSFORMS) == text
+    assert ndi_tracking.encode_tx(reply, ndi_tracking.TRANSFORMS) == text
 
 
 def test_a_disabled_handle_may_have_a_status_and_a_frame():
-    (tool,) = ndi.parse_tx("010ADISABLED0000001100000020\n0000", ndi.TRANSFORMS).tools
+    (tool,) = ndi_tracking.parse_tx("010ADISABLED0000001100000020\n0000", ndi_tracking.TRANSFORMS).tools
     assert (tool.state, tool.port_status, tool.frame_number) == (State.DISABLED, 0x11, 0x20)
 
 
@@ -208,11 +208,11 @@ def test_tx_gives_tool_and_marker_information():
         "0201MISSING000000310000040D0200000000000000000000\n"
         "02+05036+04469+04825+05601-005056+010437-202772+00180000000310000040C0000000000030000300003\n0000"
     )
-    options = ndi.TRANSFORMS | ndi.TOOL_INFORMATION
-    reply = ndi.parse_tx(text, options)
+    options = ndi_tracking.TRANSFORMS | ndi_tracking.TOOL_INFORMATION
+    reply = ndi_tracking.parse_tx(text, options)
     assert [tool.tool_information for tool in reply.tools] == [2, 0]
     assert reply.tools[1].marker_information.hex() == "00000000030000300003"
-    assert ndi.encode_tx(reply, options) == text
+    assert ndi_tracking.encode_tx(reply, options) == text
 
 
 def test_tx_gives_a_tools_stray_marker():
@@ -221,24 +221,24 @@ def test_tx_gives_a_tools_stray_marker():
         "02+01695-04062+07168+05406-004642+030104-165882+00741000000310000028801-004642+030104-165882\n"
         "03DISABLED\n00C0"
     )
-    options = ndi.TRANSFORMS | ndi.SINGLE_STRAY
-    reply = ndi.parse_tx(text, options)
+    options = ndi_tracking.TRANSFORMS | ndi_tracking.SINGLE_STRAY
+    reply = ndi_tracking.parse_tx(text, options)
     assert reply.tools[0].stray is None
     assert reply.tools[1].stray == pytest.approx((-46.42, 301.04, -1658.82))
-    assert ndi.encode_tx(reply, options) == text
+    assert ndi_tracking.encode_tx(reply, options) == text
 
 
 def test_tx_gives_stray_markers_after_the_bare_handles():
     text = "0201\n02\n030+015360+030698-223261+015173+022199-225596+007159+026725-2274150000"
-    reply = ndi.parse_tx(text, ndi.PASSIVE_STRAYS)
+    reply = ndi_tracking.parse_tx(text, ndi_tracking.PASSIVE_STRAYS)
     assert len(reply.strays.points) == 3
     assert reply.strays.points[2] == pytest.approx((71.59, 267.25, -2274.15))
-    assert ndi.encode_tx(reply, ndi.PASSIVE_STRAYS) == text
+    assert ndi_tracking.encode_tx(reply, ndi_tracking.PASSIVE_STRAYS) == text
 
 
 def test_what_a_field_cannot_hold_is_held_at_its_limit():
     tool = ToolState(1, State.VALID, (1.0, 0.0, 0.0, 0.0), (12345.678, -99999.0, 0.0), 12.5)
-    text = ndi.encode_tx(TrackingReply((tool,)), ndi.TRANSFORMS)
+    text = ndi_tracking.encode_tx(TrackingReply((tool,)), ndi_tracking.TRANSFORMS)
     assert "+999999-999999+000000+99999" in text
 
 
@@ -258,23 +258,23 @@ def test_what_a_field_cannot_hold_is_held_at_its_limit():
 )
 def test_tx_of_another_form_is_refused(text):
     with pytest.raises(ndi.NdiDamaged):
-        ndi.parse_tx(text, ndi.TRANSFORMS)
+        ndi_tracking.parse_tx(text, ndi_tracking.TRANSFORMS)
 
 
 # --- BX -----------------------------------------------------------------------------------------------------
 
 
 def test_bx_of_two_missing_tools_of_a_real_polaris():
-    reply = ndi.parse_bx(TWO_MISSING, ndi.TRANSFORMS)
+    reply = ndi_tracking.parse_bx(TWO_MISSING, ndi_tracking.TRANSFORMS)
     assert [(t.handle, t.state, t.port_status, t.frame_number) for t in reply.tools] == [
         (1, State.MISSING, 0x31, 0),
         (2, State.MISSING, 0x31, 0),
     ]
-    assert ndi.encode_bx(reply, ndi.TRANSFORMS) == TWO_MISSING
+    assert ndi_tracking.encode_bx(reply, ndi_tracking.TRANSFORMS) == TWO_MISSING
 
 
 def test_bx_of_a_seen_and_a_missing_tool_of_a_real_polaris():
-    reply = ndi.parse_bx(ONE_VALID, ndi.TRANSFORMS)
+    reply = ndi_tracking.parse_bx(ONE_VALID, ndi_tracking.TRANSFORMS)
     missing, valid = reply.tools
     assert (missing.state, missing.frame_number, valid.state, valid.frame_number) == (
         State.MISSING, 296, State.VALID, 298,
@@ -282,13 +282,15 @@ def test_bx_of_a_seen_and_a_missing_tool_of_a_real_polaris():
     assert valid.quaternion == pytest.approx((0.5592, 0.6136, 0.3869, 0.4014), abs=1e-4)
     assert valid.position == pytest.approx((-88.73, 164.83, -2199.99), abs=0.01)
     assert valid.error == pytest.approx(0.0338, abs=1e-4)
-    assert ndi.encode_bx(reply, ndi.TRANSFORMS) == ONE_VALID
+    assert ndi_tracking.encode_bx(reply, ndi_tracking.TRANSFORMS) == ONE_VALID
 
 
 def test_bx_holds_positions_to_single_precision():
     position = (12.3456789, -98.7654321, 0.1)
-    data = ndi.encode_bx(TrackingReply((ToolState(9, State.VALID, (1.0, 0, 0, 0), position, 0.0),)), 1)
-    assert ndi.parse_bx(data, 1).tools[0].position == tuple(np.float32(position).tolist())
+    data = ndi_tracking.encode_bx(
+        TrackingReply((ToolState(9, State.VALID, (1.0, 0, 0, 0), position, 0.0),)), 1
+    )
+    assert ndi_tracking.parse_bx(data, 1).tools[0].position == tuple(np.float32(position).tolist())
 
 
 @pytest.mark.parametrize("place", range(len(ONE_VALID)))
@@ -296,18 +298,18 @@ def test_a_changed_bit_anywhere_is_noticed(place):
     damaged = bytearray(ONE_VALID)
     damaged[place] ^= 0x10
     with pytest.raises(ndi.NdiDamaged):
-        ndi.parse_bx(bytes(damaged), ndi.TRANSFORMS)
+        ndi_tracking.parse_bx(bytes(damaged), ndi_tracking.TRANSFORMS)
 
 
 @pytest.mark.parametrize("size", range(len(ONE_VALID)))
 def test_a_reply_that_was_cut_is_noticed(size):
     with pytest.raises(ndi.NdiDamaged):
-        ndi.parse_bx(ONE_VALID[:size], ndi.TRANSFORMS)
+        ndi_tracking.parse_bx(ONE_VALID[:size], ndi_tracking.TRANSFORMS)
 
 
 def test_a_reply_to_other_options_is_noticed():
     with pytest.raises(ndi.NdiDamaged):
-        ndi.parse_bx(ONE_VALID, ndi.TRANSFORMS | ndi.TOOL_INFORMATION)
+        ndi_tracking.parse_bx(ONE_VALID, ndi_tracking.TRANSFORMS | ndi_tracking.TOOL_INFORMATION)
 
 
 _coordinates = st.floats(-9000, 9000, width=32)
@@ -327,7 +329,7 @@ def _tools(draw, options):
     if state is State.DISABLED:
         return ToolState(handle, state)
     values = {}
-    if options & ndi.TRANSFORMS:
+    if options & ndi_tracking.TRANSFORMS:
         values = {
             "port_status": draw(st.integers(0, 2**32 - 1)),
             "frame_number": draw(st.integers(0, 2**32 - 1)),
@@ -339,12 +341,12 @@ def _tools(draw, options):
                 "position": draw(_points),
                 "error": draw(st.floats(0, 9, width=32)),
             }
-    if options & ndi.TOOL_INFORMATION:
+    if options & ndi_tracking.TOOL_INFORMATION:
         values["tool_information"] = draw(st.integers(0, 255))
         values["marker_information"] = draw(st.binary(min_size=10, max_size=10))
-    if options & ndi.SINGLE_STRAY:
+    if options & ndi_tracking.SINGLE_STRAY:
         values["stray"] = draw(st.none() | _points)
-    if options & ndi.TOOL_MARKERS:
+    if options & ndi_tracking.TOOL_MARKERS:
         values["markers"] = draw(_markers())
     return ToolState(handle, state, **values)
 
@@ -354,7 +356,7 @@ def _replies(draw):
     options = draw(st.sets(st.sampled_from([0x0001, 0x0002, 0x0004, 0x0008, 0x0800, 0x1000]))) or {1}
     options = sum(options)
     tools = tuple(draw(st.lists(_tools(options), max_size=6)))
-    strays = draw(_markers()) if options & ndi.PASSIVE_STRAYS else Markers()
+    strays = draw(_markers()) if options & ndi_tracking.PASSIVE_STRAYS else Markers()
     return options, TrackingReply(tools, draw(st.integers(0, 0xFFFF)), strays)
 
 
@@ -366,23 +368,23 @@ def _same(one, other):
 @settings(max_examples=200)
 def test_bx_comes_back_as_it_was_with_all_options(case):
     options, reply = case
-    assert _same(ndi.parse_bx(ndi.encode_bx(reply, options), options), reply)
+    assert _same(ndi_tracking.parse_bx(ndi_tracking.encode_bx(reply, options), options), reply)
 
 
 @given(_replies())
 @settings(max_examples=200)
 def test_tx_comes_back_to_its_own_precision_with_all_options(case):
     options, reply = case
-    text = ndi.encode_tx(reply, options)
-    again = ndi.parse_tx(text, options)
-    assert ndi.encode_tx(again, options) == text
+    text = ndi_tracking.encode_tx(reply, options)
+    again = ndi_tracking.parse_tx(text, options)
+    assert ndi_tracking.encode_tx(again, options) == text
     for sent, got in zip(reply.tools, again.tools, strict=True):
         assert (sent.handle, sent.port_status, sent.frame_number) == (
             got.handle,
             got.port_status,
             got.frame_number,
         )
-        if options & ndi.TRANSFORMS:
+        if options & ndi_tracking.TRANSFORMS:
             assert sent.state is got.state
             np.testing.assert_allclose(got.position, sent.position, atol=0.00501)
             np.testing.assert_allclose(got.quaternion, sent.quaternion, atol=0.0000501)
@@ -393,7 +395,7 @@ def test_tx_comes_back_to_its_own_precision_with_all_options(case):
 
 def read_all(data, cuts=()):
     """Everything that a reader finds in the bytes, fed in the pieces between the cuts."""
-    reader, items, start = ndi.ReplyReader(), [], 0
+    reader, items, start = ndi_reader.ReplyReader(), [], 0
     for cut in [*sorted(cuts), len(data)]:
         reader.feed(data[start:cut])
         start = cut
@@ -403,11 +405,11 @@ def read_all(data, cuts=()):
 
 
 def good(items):
-    return [item.data for item in items if isinstance(item, ndi.Reply)]
+    return [item.data for item in items if isinstance(item, ndi_reader.Reply)]
 
 
 def damaged_bytes(items):
-    return sum(item.size for item in items if isinstance(item, ndi.Damage))
+    return sum(item.size for item in items if isinstance(item, ndi_reader.Damage))
 
 
 TEXT = ndi.reply("OKAY")
@@ -492,19 +494,19 @@ def test_damage_never_hides_what_comes_much_later(records, data):
 
 
 def test_a_reader_holds_a_bounded_number_of_bytes():
-    reader = ndi.ReplyReader()
+    reader = ndi_reader.ReplyReader()
     for _ in range(200):
         reader.feed(b"text without an end " * 100)
         while reader.next() is not None:
             pass
-    assert reader.clear() <= ndi.MAX_BUFFER
+    assert reader.clear() <= ndi_reader.MAX_BUFFER
     with pytest.raises(ndi.NdiDamaged):
-        reader.feed(bytes(ndi.MAX_BUFFER + 1))
+        reader.feed(bytes(ndi_reader.MAX_BUFFER + 1))
     assert not reader.pending
 
 
 def test_headers_that_promise_much_are_not_checked_again_and_again():
-    header = ndi.BX_START + struct.pack("<H", 0x4000)
+    header = ndi_tracking.BX_START + struct.pack("<H", 0x4000)
     header += struct.pack("<H", ndi.crc16(header)) + b"\x01\x02"
     items, _ = read_all(header * 10_000 + bytes(0x8000) + TEXT)
     assert good(items) == [TEXT]
@@ -513,7 +515,7 @@ def test_headers_that_promise_much_are_not_checked_again_and_again():
 @given(st.binary(max_size=300))
 @settings(max_examples=300)
 def test_parsers_refuse_bytes_with_their_own_exceptions_only(data):
-    for parse in (ndi.parse_command, ndi.parse_reply, lambda d: ndi.parse_bx(d, 0x180F)):
+    for parse in (ndi.parse_command, ndi.parse_reply, lambda d: ndi_tracking.parse_bx(d, 0x180F)):
         try:
             parse(data)
         except (ndi.NdiDamaged, ndi.NdiError):
@@ -524,7 +526,7 @@ def test_parsers_refuse_bytes_with_their_own_exceptions_only(data):
 @settings(max_examples=300)
 def test_text_parsers_refuse_text_with_their_own_exceptions_only(text, options):
     for parse in (
-        lambda t: ndi.parse_tx(t, options),
+        lambda t: ndi_tracking.parse_tx(t, options),
         lambda t: ndi.parse_phinf(t, options),
         ndi.parse_phsr,
         ndi.parse_ver,
@@ -539,10 +541,10 @@ def test_text_parsers_refuse_text_with_their_own_exceptions_only(text, options):
 @given(st.binary(max_size=200), st.integers(0, 0x1FFF))
 @settings(max_examples=300)
 def test_a_body_with_right_crcs_may_hold_anything(body, options):
-    header = ndi.BX_START + struct.pack("<H", len(body))
+    header = ndi_tracking.BX_START + struct.pack("<H", len(body))
     data = header + struct.pack("<H", ndi.crc16(header)) + body + struct.pack("<H", ndi.crc16(body))
     try:
-        ndi.parse_bx(data, options)
+        ndi_tracking.parse_bx(data, options)
     except ndi.NdiDamaged:
         pass
 
@@ -551,7 +553,7 @@ def test_a_reply_of_the_right_length_with_a_wrong_crc_is_told_without_waiting_fo
     for place in range(6, len(ONE_VALID)):
         damaged = bytearray(ONE_VALID)
         damaged[place] = 0x0D if damaged[place] != 0x0D else 0x0A
-        reader = ndi.ReplyReader()
+        reader = ndi_reader.ReplyReader()
         reader.feed(bytes(damaged))
-        assert reader.next() == ndi.Damage(len(ONE_VALID))
+        assert reader.next() == ndi_reader.Damage(len(ONE_VALID))
         assert not reader.pending

@@ -11,8 +11,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tonguetrack.drivers.devices import ndi
-from tonguetrack.drivers.devices.ndi import State
+from tonguetrack.drivers.devices import ndi, ndi_reader, ndi_tracking
+from tonguetrack.drivers.devices.ndi_tracking import State
 
 LINE = re.compile(r"[\d.]+\s+:\s+\(INFO\) \d+\. (command|receive)\[(\d+)\] (.*)")
 AURORA = ("aurora_stream_09_28_2005", "aurora_stream_11_04_2005", "aurora_stream_11_05_2005")
@@ -43,7 +43,7 @@ def exchanges_of(reference_data, name):
         assert len(data) == int(size)
         if direction == "command":
             command = data
-        elif data[:2] == ndi.BX_START:
+        elif data[:2] == ndi_tracking.BX_START:
             header = data  # the body was received by itself
         else:
             found.append(Exchange(command, header + data))
@@ -64,9 +64,9 @@ def options_of(exchange):
 
 
 def tracking_of(exchange):
-    if exchange.reply[:2] == ndi.BX_START:
-        return ndi.parse_bx(exchange.reply, options_of(exchange))
-    return ndi.parse_tx(ndi.parse_reply(exchange.reply), options_of(exchange))
+    if exchange.reply[:2] == ndi_tracking.BX_START:
+        return ndi_tracking.parse_bx(exchange.reply, options_of(exchange))
+    return ndi_tracking.parse_tx(ndi.parse_reply(exchange.reply), options_of(exchange))
 
 
 def named(exchanges, *names):
@@ -86,10 +86,10 @@ def test_every_record_of_the_aurora_has_a_good_crc(reference_data, name):
 def test_every_record_of_the_polaris_has_good_crcs_and_lengths(reference_data):
     exchanges = exchanges_of(reference_data, POLARIS)
     assert all(ndi.parse_command(e.command).crc_ok for e in exchanges if e.command)
-    binary = [e for e in exchanges if e.reply[:2] == ndi.BX_START]
+    binary = [e for e in exchanges if e.reply[:2] == ndi_tracking.BX_START]
     assert len(binary) == 151
     assert Counter(map(options_of, binary)) == {0x0001: 50, 0x1000: 50, 0x0005: 50, 0x0003: 1}
-    assert all(answer_of(e.reply) for e in exchanges if e.reply[:2] != ndi.BX_START)
+    assert all(answer_of(e.reply) for e in exchanges if e.reply[:2] != ndi_tracking.BX_START)
 
 
 @pytest.mark.parametrize("name", [*AURORA, POLARIS])
@@ -98,17 +98,17 @@ def test_every_tracking_reply_is_understood_and_written_back_byte_for_byte(refer
     assert replies
     for exchange in replies:
         tracking, options = tracking_of(exchange), options_of(exchange)
-        if exchange.reply[:2] == ndi.BX_START:
-            assert ndi.encode_bx(tracking, options) == exchange.reply
+        if exchange.reply[:2] == ndi_tracking.BX_START:
+            assert ndi_tracking.encode_bx(tracking, options) == exchange.reply
         else:
-            assert ndi.reply(ndi.encode_tx(tracking, options)) == exchange.reply
+            assert ndi.reply(ndi_tracking.encode_tx(tracking, options)) == exchange.reply
 
 
 def test_the_tracking_replies_hold_what_was_in_front_of_the_devices(reference_data):
     transforms, positionless = 0, 0
     for name in (*AURORA, POLARIS):
         for exchange in named(exchanges_of(reference_data, name), "TX", "BX"):
-            if not options_of(exchange) & ndi.TRANSFORMS:
+            if not options_of(exchange) & ndi_tracking.TRANSFORMS:
                 continue
             for tool in tracking_of(exchange).tools:
                 if tool.state is not State.VALID:
@@ -190,13 +190,13 @@ def is_good(reply):
 def read_in_pieces(stream, seed, keep_damage=False):
     """The replies, and where asked the sizes of the damaged pieces, of a stream in pieces of 1 to 99 bytes."""
     random = np.random.default_rng(seed)
-    reader, start = ndi.ReplyReader(), 0
+    reader, start = ndi_reader.ReplyReader(), 0
     while start < len(stream):
         size = int(random.integers(1, 100))
         reader.feed(stream[start : start + size])
         start += size
         while (item := reader.next()) is not None:
-            if isinstance(item, ndi.Reply):
+            if isinstance(item, ndi_reader.Reply):
                 yield item.data
             elif keep_damage:
                 yield item.size

@@ -21,7 +21,8 @@ import numpy as np
 import pytest
 
 from tonguetrack import InputError
-from tonguetrack.drivers.devices.ndi import command, parse_bx, parse_reply
+from tonguetrack.drivers.devices.ndi import command, parse_reply
+from tonguetrack.drivers.devices.ndi_tracking import parse_bx
 from tonguetrack.drivers.frames import Recording
 from tonguetrack.drivers.simulators.faults import FaultPlan
 from tonguetrack.drivers.simulators.motion import SimulatedMotion

@@ -10,17 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tonguetrack.drivers.devices.ndi import (
-    NdiError,
-    ReplyReader,
-    State,
-    TrackingReply,
-    command,
-    parse_bx,
-    parse_reply,
-    parse_tx,
-)
-from tonguetrack.drivers.devices.ndi import Reply as WholeReply
+from tonguetrack.drivers.devices.ndi import NdiError, command, parse_reply
+from tonguetrack.drivers.devices.ndi_reader import Reply as WholeReply
+from tonguetrack.drivers.devices.ndi_reader import ReplyReader
+from tonguetrack.drivers.devices.ndi_tracking import State, TrackingReply, parse_bx, parse_tx
 from tonguetrack.drivers.frames import Recording
 from tonguetrack.drivers.simulators.faults import parse_faults
 from tonguetrack.drivers.simulators.motion import SimulatedMotion

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tonguetrack import InputError
-from tonguetrack.drivers.devices import ndi, ndi_source
+from tonguetrack.drivers.devices import ndi, ndi_source, ndi_tracking
 from tonguetrack.drivers.devices.link import LinkLost, SerialLink
-from tonguetrack.drivers.devices.ndi import State, ToolState, TrackingReply
+from tonguetrack.drivers.devices.ndi_tracking import State, ToolState, TrackingReply
 from tonguetrack.drivers.frames import CoilFrame, NoteKind
 from tonguetrack.drivers.sources import open_device, parse_source
 
@@ -90,10 +90,10 @@ class Device:
         return "Features.Firmware.Version=013\n"
 
     def _bx(self, arguments):
-        return self._measured(lambda reply: ndi.encode_bx(reply, 0x0801))
+        return self._measured(lambda reply: ndi_tracking.encode_bx(reply, 0x0801))
 
     def _tx(self, arguments):
-        return self._measured(lambda reply: ndi.reply(ndi.encode_tx(reply, 0x0801)))
+        return self._measured(lambda reply: ndi.reply(ndi_tracking.encode_tx(reply, 0x0801)))
 
     def _measured(self, encode):
         measurement = self.measurements.pop(0) if len(self.measurements) > 1 else self.measurements[0]
@@ -460,7 +460,7 @@ def test_a_device_that_does_not_know_bx_is_asked_by_tx(serial):
 
 
 def damaged_bx(number, place=30):
-    data = bytearray(ndi.encode_bx(TrackingReply(moving(number)[0]), 0x0801))
+    data = bytearray(ndi_tracking.encode_bx(TrackingReply(moving(number)[0]), 0x0801))
     data[place] ^= 0x55
     return bytes(data)
 
@@ -475,7 +475,7 @@ def test_a_damaged_reply_is_told_and_the_next_one_taken(serial, place):
 
 
 def test_a_reply_that_breaks_off_is_told_and_the_next_one_taken(serial):
-    whole = ndi.encode_bx(TrackingReply(moving(16)[0]), 0x0801)
+    whole = ndi_tracking.encode_bx(TrackingReply(moving(16)[0]), 0x0801)
     with serial(Device(measurements=[*moving(8), whole[:50], *moving(24)]), "?baud=9600") as source:
         items = items_of(source, 2)
     assert [number for number, _, _ in frames_of(items)] == [8, 24]
@@ -511,7 +511,7 @@ def test_a_poll_that_is_not_answered_is_sent_again(serial):
 
 
 def test_an_answer_that_came_late_does_not_put_all_later_ones_off_by_one(serial):
-    two = b"".join(ndi.encode_bx(TrackingReply(m), 0x0801) for m in moving(16, 24))
+    two = b"".join(ndi_tracking.encode_bx(TrackingReply(m), 0x0801) for m in moving(16, 24))
     device = Device(measurements=[*moving(8), b"", two, *moving(32, 40)])
     with serial(device, "?baud=9600") as source:
         numbers = [number for number, _, _ in frames_of(items_of(source, 5))]
@@ -538,7 +538,7 @@ def test_goodbye_ends_soon_where_the_device_is_mute(serial):
 
 
 def test_a_new_bit_of_the_system_status_is_told_once(serial):
-    bad = [ndi.encode_bx(TrackingReply(m, system_status=0x0012), 0x0801) for m in moving(16, 24)]
+    bad = [ndi_tracking.encode_bx(TrackingReply(m, system_status=0x0012), 0x0801) for m in moving(16, 24)]
     with serial(Device(measurements=[*moving(8), *bad, *moving(32, 40)]), "?baud=9600") as source:
         items = items_of(source, 5)
     told = [text for text in texts_of(items, NoteKind.INFO) if "system status" in text]
@@ -645,7 +645,7 @@ def test_whatever_comes_in_the_place_of_replies_no_wrong_frame_comes_out(serial,
     random = np.random.default_rng(3)
     measurements = []
     for number in range(8, 8 * 151, 8):
-        good = ndi.encode_bx(TrackingReply(moving(number)[0]), 0x0801)
+        good = ndi_tracking.encode_bx(TrackingReply(moving(number)[0]), 0x0801)
         kind = random.integers(6)
         if kind == 0:
             good = random.bytes(int(random.integers(200)))

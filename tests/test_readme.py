@@ -61,6 +61,14 @@ README = {
 }
 
 DOCS = {
+    (
+        '.venv/bin/tonguetrack live ndi+rfc2217://127.0.0.1:8765 --coils "port 1=tongue_tip,port 1b=tongue_blade,'
+        'port 2=tongue_dorsum"'
+    ): ELSEWHERE + "test_the_docs_commands_for_simulated_devices",
+    (
+        '.venv/bin/tonguetrack live "carstens://127.0.0.1:30303?layout=ag501" --coils '
+        "Ch1=tongue_tip,Ch2=tongue_blade,Ch3=tongue_dorsum"
+    ): ELSEWHERE + "test_the_docs_commands_for_simulated_devices",
     FIRST_TAKE: HERE,
     ".venv/bin/tonguetrack doctor": ELSEWHERE + "test_doctor.py, where what is found may be anything",
     ".venv/bin/tonguetrack devices": HERE,
@@ -402,6 +410,35 @@ def test_the_readmes_two_commands_for_a_wave(newcomer):
         wave.communicate(timeout=20)
     assert "[speaker]" in (newcomer / "session.toml").read_text()
     typed(f"{tool()} take info take.xdf --check", newcomer)
+
+
+@pytest.mark.parametrize(
+    ("device", "words", "usual"),
+    [
+        ("ndi --from recordings/demo.csv --rfc2217", "ndi+rfc2217", "ndi+rfc2217://127.0.0.1:8765"),
+        (
+            "carstens --from recordings/demo.csv --layout ag501",
+            "carstens",
+            "carstens://127.0.0.1:30303?layout=ag501",
+        ),
+    ],
+)
+def test_the_docs_commands_for_simulated_devices(newcomer, device, words, usual):
+    """On a free port, for a second."""
+    (command,) = [
+        command for command in DOCS if command.startswith(".venv/bin/tonguetrack live") and words in command
+    ]
+    with subprocess.Popen(
+        [tool(), "simulate", "device", *device.split(), "--port", "0"],
+        cwd=newcomer, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    ) as simulator:  # fmt: skip
+        try:
+            assert simulator.stdout is not None
+            address = simulator.stdout.readline().strip()
+            assert usual in command
+            typed(command.replace(usual, address) + " --seconds 1", newcomer)
+        finally:
+            simulator.terminate()
 
 
 def test_the_docs_quote_what_model_info_prints(tmp_path):

@@ -14,7 +14,7 @@ import numpy as np
 from ... import InputError
 from ..frames import CoilFrame, FrameOfReference, NoteKind, SourceNote
 from ..sources import SourceAddress
-from . import ndi
+from . import ndi, ndi_reader, ndi_tracking
 from .link import Link, LinkLost, SerialLink, connect_tcp, open_serial
 from .numberclock import NumberClock
 from .source import DeviceSource
@@ -35,7 +35,7 @@ DAMAGED_QUIET_S = 0.05
 TRIES = 3
 BAD_IN_A_ROW = 5
 GOODBYE_TIMEOUT_S = 0.8
-REPLY_OPTIONS = ndi.TRANSFORMS | ndi.OUT_OF_VOLUME_TOO
+REPLY_OPTIONS = ndi_tracking.TRANSFORMS | ndi_tracking.OUT_OF_VOLUME_TOO
 INFORMATION = ndi.PHINF_TOOL | ndi.PHINF_PART_NUMBER | ndi.PHINF_LOCATION
 ALL_PORTS, FREE_PORTS, NEW_PORTS, INITIALISED_PORTS = "00", "01", "02", "03"
 ROUNDS = 4
@@ -138,7 +138,7 @@ class Device:
 
     def __init__(self, link: Link) -> None:
         self.link = link
-        self.reader = ndi.ReplyReader()
+        self.reader = ndi_reader.ReplyReader()
         self.notes: list[str] = []
 
     def ask(self, name: str, arguments: str = "", timeout_s: float = COMMAND_TIMEOUT_S) -> str:
@@ -152,7 +152,7 @@ class Device:
             reply = self._wait(timeout_s)
             if reply is None:
                 raise LinkLost(f"{self.link.address} did not answer {name} within {timeout_s:g} s")
-            if isinstance(reply, ndi.Reply):
+            if isinstance(reply, ndi_reader.Reply):
                 try:
                     return ndi.parse_reply(reply.data)
                 except ndi.NdiError as refusal:
@@ -167,7 +167,7 @@ class Device:
         deadline = time.perf_counter() + timeout_s
         while (left_s := deadline - time.perf_counter()) > 0:
             item = self._wait(left_s)
-            if isinstance(item, ndi.Reply) and not item.binary:
+            if isinstance(item, ndi_reader.Reply) and not item.binary:
                 try:
                     return ndi.parse_reply(item.data)
                 except ndi.NdiError as refusal:
@@ -300,7 +300,7 @@ class Device:
             return False
         return True
 
-    def _wait(self, timeout_s: float) -> ndi.Reply | ndi.Damage | None:
+    def _wait(self, timeout_s: float) -> ndi_reader.Reply | ndi_reader.Damage | None:
         """The next reply or damaged piece; None when nothing, or only the beginning of something, came in time."""
         deadline = time.perf_counter() + timeout_s
         while (item := self.reader.next()) is None:
@@ -310,7 +310,7 @@ class Device:
             if data:
                 self.reader.feed(data)
             elif self.reader.pending:
-                return ndi.Damage(self.reader.clear())
+                return ndi_reader.Damage(self.reader.clear())
             elif time.perf_counter() >= deadline:
                 return None
         return item
@@ -368,7 +368,7 @@ class NdiConversation:
         self._steps: deque[int] = deque(maxlen=RECENT_STEPS)
         self._usual_step = 0
         self._numbers = np.full(len(coils), -1, np.int64)
-        self._states = [ndi.State.VALID] * len(coils)
+        self._states = [ndi_tracking.State.VALID] * len(coils)
         self._positions = np.full((len(coils), 3), np.nan)
         self._quaternions = np.full((len(coils), 4), np.nan)
         self._rms = np.full(len(coils), np.nan)
@@ -392,12 +392,12 @@ class NdiConversation:
             if not self._asked and not self._poll(deadline):
                 return None
             item = self._reader.next()
-            if isinstance(item, ndi.Reply):
+            if isinstance(item, ndi_reader.Reply):
                 self._asked = False
                 frame = self._understand(item)
                 if frame is not None:
                     return frame
-            elif isinstance(item, ndi.Damage):
+            elif isinstance(item, ndi_reader.Damage):
                 self._asked = False
                 self._count_bad(f"{item.size} bytes that are no whole reply")
             elif not self._listen(deadline):
@@ -454,15 +454,15 @@ class NdiConversation:
             self._heard_s = self._arrival_ns * 1e-9
             self._reader.feed(data)
 
-    def _understand(self, reply: ndi.Reply) -> CoilFrame | None:
+    def _understand(self, reply: ndi_reader.Reply) -> CoilFrame | None:
         try:
             if reply.binary:
-                tracking = ndi.parse_bx(reply.data, REPLY_OPTIONS)
+                tracking = ndi_tracking.parse_bx(reply.data, REPLY_OPTIONS)
             else:
                 text = ndi.parse_reply(reply.data)
                 if text == ndi.RESET_REPLY:
                     raise LinkLost(f"{self._link.address}: the device was reset")
-                tracking = ndi.parse_tx(text, REPLY_OPTIONS)
+                tracking = ndi_tracking.parse_tx(text, REPLY_OPTIONS)
         except ndi.NdiError as refusal:
             self._refused(refusal)
             return None
@@ -487,16 +487,21 @@ class NdiConversation:
             raise LinkLost(f"{self._link.address}: {self._bad} replies in a row are bad, the last: {words}")
         self._notes.append(SourceNote(NoteKind.BAD_DATA, words, time.perf_counter_ns(), 1))
 
-    def _take(self, tracking: ndi.TrackingReply, arrival_ns: int) -> CoilFrame | None:
+    def _take(self, tracking: ndi_tracking.TrackingReply, arrival_ns: int) -> CoilFrame | None:
         """The frame, or None where nothing new was measured; then the device is spared for a moment."""
         if tracking.system_status != self._system_status:
-            words = ndi.status_words(tracking.system_status & ~self._system_status, ndi.SYSTEM_STATUS)
+            words = ndi_tracking.status_words(
+                tracking.system_status & ~self._system_status, ndi_tracking.SYSTEM_STATUS
+            )
             self._system_status = tracking.system_status
             if words:
                 self._notes.append(_info(f"the device's system status: {words}"))
         newest = -1
         for tool in tracking.tools:
-            if tool.handle in self._index and tool.state in (ndi.State.VALID, ndi.State.MISSING):
+            if tool.handle in self._index and tool.state in (
+                ndi_tracking.State.VALID,
+                ndi_tracking.State.MISSING,
+            ):
                 newest = max(newest, tool.frame_number)
         if newest <= 0 or self._newest - 2 * self._usual_step <= newest <= self._newest:
             pause_s = min(LONGEST_PAUSE_S, self._period_s * PAUSE_SHARE)
@@ -521,7 +526,7 @@ class NdiConversation:
             self._status,
         )
 
-    def _fill(self, index: int, tool: ndi.ToolState) -> None:
+    def _fill(self, index: int, tool: ndi_tracking.ToolState) -> None:
         if tool.state is not self._states[index]:
             self._tell_state(index, tool.state)
         self._status[index] = tool.port_status
@@ -529,14 +534,14 @@ class NdiConversation:
         stale = tool.frame_number == self._numbers[index] and lags > self._usual_step > 0
         self._numbers[index] = tool.frame_number
         values = (*tool.quaternion, *tool.position, tool.error)
-        if tool.state is ndi.State.VALID and not stale and all(map(math.isfinite, values)):
+        if tool.state is ndi_tracking.State.VALID and not stale and all(map(math.isfinite, values)):
             self._positions[index] = tool.position
             self._quaternions[index] = tool.quaternion
             self._rms[index] = tool.error
 
-    def _tell_state(self, index: int, state: ndi.State) -> None:
+    def _tell_state(self, index: int, state: ndi_tracking.State) -> None:
         """A tool that is unplugged or plugged in again is worth a sentence; one that is missing is not."""
-        gone = (ndi.State.DISABLED, ndi.State.UNOCCUPIED)
+        gone = (ndi_tracking.State.DISABLED, ndi_tracking.State.UNOCCUPIED)
         if (state in gone) != (self._states[index] in gone):
             words = "was unplugged or disabled" if state in gone else "is enabled again"
             self._notes.append(_info(f"{self.coils[index]} {words}"))

@@ -19,26 +19,28 @@ from ... import InputError
 from ..devices.ndi import (
     BAUD_CODES,
     OKAY,
-    OUT_OF_VOLUME_TOO,
-    REPLY_OPTIONS,
     RESET_REPLY,
-    TRANSFORMS,
     NdiDamaged,
     NdiError,
     PortHandle,
     PortInformation,
     PortLocation,
-    State,
     ToolInformation,
-    ToolState,
-    TrackingReply,
-    encode_bx,
     encode_phinf,
     encode_phsr,
-    encode_tx,
     error_reply,
     parse_command,
     reply,
+)
+from ..devices.ndi_tracking import (
+    OUT_OF_VOLUME_TOO,
+    REPLY_OPTIONS,
+    TRANSFORMS,
+    State,
+    ToolState,
+    TrackingReply,
+    encode_bx,
+    encode_tx,
 )
 from .faults import FaultPlan, Misbehaviour
 from .motion import DeviceFrame, SimulatedMotion
@@ -564,7 +566,7 @@ def without_roll(w: float, x: float, y: float, z: float) -> tuple[float, float, 
     """The rotation with qz = 0 that turns the z axis to the same direction: all that a sensor with five degrees
     of freedom can tell. Takes and gives a unit quaternion (w, x, y, z)."""
     size = float(np.hypot(w, z))
-    if size == 0.0:  # the z axis is turned around: any turn about it is as good
+    if size < 1e-12:  # the z axis is turned around: any turn about it is as good
         return (0.0, x, y, 0.0)
     cosine, sine = w / size, -z / size
     return (size, x * cosine + y * sine, y * cosine - x * sine, 0.0)
