@@ -15,6 +15,7 @@ EXIT_BAD_INPUT = 2
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line as an argparse parser."""
     from . import (
+        anatomy,
         bench,
         calibrate,
         demo,
@@ -38,7 +39,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"tonguetrack {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for family in (
-        demo, live, track, calibrate, files, take, devices, doctor, model, evaluate, experiment, simulate, monitor, bench,
+        demo, live, track, calibrate, anatomy, files, take, devices, doctor, model, evaluate, experiment, simulate,
+        monitor, bench,
     ):  # fmt: skip
         family.add_commands(commands)
     return parser
