@@ -47,6 +47,7 @@ def gather(source: Source, seconds: float, told: Callable[[str], None] = lambda 
     Raises InputError where no frame comes within PATIENCE_S, or the source ends before the first one.
     """
     positions: list[np.ndarray] = []
+    turns: list[np.ndarray] = []
     times: list[float] = []
     last: CoilFrame | None = None
     since = time.perf_counter()
@@ -55,6 +56,8 @@ def gather(source: Source, seconds: float, told: Callable[[str], None] = lambda 
         if isinstance(item, CoilFrame):
             times.append(times[-1] + _step_s(last, item) if last is not None else 0.0)
             positions.append(np.array(item.positions))
+            if item.quaternions is not None:
+                turns.append(np.array(item.quaternions))
             last = item
             if times[-1] >= seconds or len(times) >= MAX_FRAMES:
                 break
@@ -69,7 +72,8 @@ def gather(source: Source, seconds: float, told: Callable[[str], None] = lambda 
     if not times:
         raise InputError(f"{source.address}: the source ended before its first frame.")
     rate_hz = source.rate_hz or ((len(times) - 1) / times[-1] if times[-1] > 0 else UNKNOWN_RATE_HZ)
-    return _recording(source, np.stack(positions), np.asarray(times), rate_hz)
+    quaternions = np.stack(turns) if len(turns) == len(times) else None
+    return _recording(source, np.stack(positions), np.asarray(times), rate_hz, quaternions)
 
 
 def _step_s(last: CoilFrame, frame: CoilFrame) -> float:
@@ -80,7 +84,13 @@ def _step_s(last: CoilFrame, frame: CoilFrame) -> float:
     return max((frame.arrival_ns - last.arrival_ns) * 1e-9, SHORTEST_STEP_S)
 
 
-def _recording(source: Source, positions: np.ndarray, times_s: np.ndarray, rate_hz: float) -> Recording:
+def _recording(
+    source: Source,
+    positions: np.ndarray,
+    times_s: np.ndarray,
+    rate_hz: float,
+    quaternions: np.ndarray | None = None,
+) -> Recording:
     return Recording(
         coils=source.coils,
         positions=positions,
@@ -88,5 +98,6 @@ def _recording(source: Source, positions: np.ndarray, times_s: np.ndarray, rate_
         rate_hz=rate_hz,
         format="live",
         frame=source.frame,
+        quaternions=quaternions,
         source=source.address,
     )

@@ -61,6 +61,11 @@ def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]
                       "estimated in the background (default mean)")  # fmt: skip
     live.add_argument("--control", metavar="HOST:PORT",
                       help="where control messages over OSC are taken (default 127.0.0.1:9001)")  # fmt: skip
+    live.add_argument("--calibrate", metavar="FOLDER",
+                      help="first lead the speaker through rest, bite plane, palate sweep and vowels, as far as there "
+                      "are coils for them; keep recordings, session and report there, and go on with that session")  # fmt: skip
+    live.add_argument("--frame", metavar="'X Y Z'",
+                      help='for --calibrate: where the device\'s axes grow, as in "front left up"')  # fmt: skip
     live.add_argument("--save-session", metavar="FILE",
                       help="at the end, write the session with everything that was estimated")  # fmt: skip
     live.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -73,6 +78,7 @@ def run_live_command(args: argparse.Namespace) -> int:
 
     from ... import InputError
     from ..control import ControlQueue
+    from ..guided import check_new_folder
     from ..online import compile_kernels
     from ..sources import open_source
     from ..streams.osc import resolve
@@ -91,6 +97,10 @@ def run_live_command(args: argparse.Namespace) -> int:
         prepare_folder(Path(output))
     if args.save_session and Path(args.save_session).is_dir():
         raise InputError(f"--save-session {args.save_session}: this is a folder; name a file.")
+    if args.frame and not args.calibrate:
+        raise InputError("--frame goes with --calibrate; a session says it in its [alignment].")
+    if args.calibrate:
+        check_new_folder(Path(args.calibrate))
     if args.record:
         check_place(args.record)
         if is_folder(Path(args.record)):
@@ -146,6 +156,8 @@ def show(args: argparse.Namespace, summary: Summary) -> None:
 
 def run_source(job: Job, source: Source) -> Summary | None:
     """One run; where clients drive the source, one after the other until it is stopped."""
+    from pathlib import Path
+
     from ...drivers.devices.authors_live import AuthorsLive
     from ..gathering import recording_for_setup
     from ..online import Tracker
@@ -153,8 +165,13 @@ def run_source(job: Job, source: Source) -> Summary | None:
 
     if isinstance(source, AuthorsLive):
         return serve_clients(job, source)
-    recording = recording_for_setup(source, job.session, LISTEN_S, say)
-    setup = complete_setup(recording, job.model, job.session)
+    session = job.session
+    if job.args.calibrate:
+        from .guiding import guided_session
+
+        session = guided_session(source, job.model, session, Path(job.args.calibrate), job.args.frame)
+    recording = recording_for_setup(source, session, LISTEN_S, say)
+    setup = complete_setup(recording, job.model, session)
     for decision in setup.decisions:
         say(decision)
     fix_after_s = job.args.fix_speaker_after if job.args.speaker == "mean" else None
