@@ -29,9 +29,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from .. import InputError
@@ -40,6 +42,7 @@ from ..model.multilinear import Mode, TongueModel
 from .anatomy import SpeakerEstimator
 from .coilmap import LATERAL_ROLES, TONGUE_ROLES
 from .correspondences import Correspondences, Places, complete_frames, slid_along_contour
+from .kernels import OPTIONS
 from .palate import Palate
 from .pose import FloatArray
 from .session import Energy
@@ -58,6 +61,7 @@ NOISES_MM = np.geomspace(0.1, MODEL_NOISE_MM, 25)
 OUTLIER_MEDIANS = 6.0
 PALATE_SD_MM = 0.5
 WORST_SHARE = 0.05  # of the frames, for the palate's bound
+PALATE_STRIDE = 3  # of the shown frames, while the motion is sought
 ROUGH_ROUNDS, ROUNDS = 2, 15
 FINISHED_ENDS = 2
 ADAPTATIONS = 4  # between two slides along the contour
@@ -259,6 +263,67 @@ def _settled(posterior: Callable[[], _Posterior]) -> tuple[_Posterior, _Found]:
     return min(settled, key=lambda one: one[0].value(one[1].unknowns, one[1].places, noise))
 
 
+class FrameTerms(NamedTuple):
+    """value: of the mean frame; slope: (m,) its derivatives in the raw speaker weights; off: (axes,) to be added to
+    coils for their deviation from what is expected; gain: (n, axes) of the pose; inverse: (axes, axes) of the
+    expected covariance; directions: (n, axes) d v / d p."""
+
+    value: float
+    slope: FloatArray
+    off: FloatArray
+    gain: FloatArray
+    inverse: FloatArray
+    directions: FloatArray
+
+
+@njit(**OPTIONS)
+def rotation_about(turn: FloatArray) -> FloatArray:
+    """(3, 3) from a rotation vector (3,), radians."""
+    angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+    rotation = np.eye(3)
+    if angle > 0.0:
+        x, y, z = turn[0] / angle, turn[1] / angle, turn[2] / angle
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        rotation = rotation + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    return rotation
+
+
+@njit(**OPTIONS)
+def mean_frame(
+    core: FloatArray, origin: FloatArray, speaker: FloatArray, pose_mean: FloatArray, pose_covariance: FloatArray,
+    frames_mean: FloatArray, frames_covariance: FloatArray, rotation: FloatArray, translation: FloatArray,
+    axes: NDArray[np.int64], noise_mm: float,
+) -> FrameTerms:  # fmt: skip
+    """-log Normal of the mean frame: core (m, n, a) and origin (a,) at the coils' measured axes (a,), which are
+    indices into the coordinates (3n,) of frames_mean and frames_covariance, these before the motion."""
+    speakers, poses, size = core.shape
+    turned = np.zeros((size, frames_mean.shape[0]))
+    middle = np.zeros(size)
+    for row in range(size):
+        coil, axis = axes[row] // 3, axes[row] % 3
+        middle[row] = translation[axis]
+        for other in range(3):
+            turned[row, 3 * coil + other] = rotation[axis, other]
+            middle[row] += rotation[axis, other] * frames_mean[3 * coil + other]
+    spread = turned @ frames_covariance @ turned.T
+    directions = np.zeros((poses, size))
+    for weight in range(speakers):
+        directions += speaker[weight] * core[weight]
+    answering = pose_covariance @ directions
+    expected_middle = origin + pose_mean @ directions
+    off = middle - expected_middle
+    inverse = np.linalg.inv(directions.T @ answering + noise_mm**2 * np.eye(size))
+    pull = inverse @ off
+    value = 0.5 * (np.sum(inverse * spread) + np.sum(off * pull) - np.linalg.slogdet(inverse)[1])
+    narrower = inverse - inverse @ spread @ inverse - np.outer(pull, pull)
+    by_direction = answering @ narrower - np.outer(pose_mean, pull)
+    slope = np.zeros(speakers)
+    for weight in range(speakers):
+        slope[weight] = np.sum(core[weight] * by_direction)
+    # The most probable pose = mean + gain @ (coils - expected).
+    return FrameTerms(value, slope, -expected_middle, answering @ inverse, inverse, directions)
+
+
 @dataclass(frozen=True)
 class _Found:
     """An end of the search. unknowns: motion, then the speaker in measured sigma; value: J there."""
@@ -311,7 +376,7 @@ class _Posterior:
         steps = np.linalg.norm(np.diff(self._mean[: len(contour), 1:], axis=0), axis=1)
         self._along = np.concatenate([[0.0], np.cumsum(steps)])
         self._speaker_sd, pose_sd = (_measured_sigma(mode) for mode in (model.speaker, model.pose))
-        self._pose_mean = model.pose.mean
+        self._pose_mean = model.pose.mean.copy()  # read-only arrays are another type for the compiler
         self._pose_covariance = np.diag(pose_sd**2)
         self.size = 3 if midsagittal else 6
         self._shifts = 2 if midsagittal else 3  # the rest of the motion turns
@@ -321,8 +386,9 @@ class _Posterior:
             [guess.translation_sd_mm] * self._shifts + [np.radians(guess.rotation_sd_deg)] * turns
         )
         # The axes that are measured: across the plane, projected coils say nothing.
-        self._axes = np.flatnonzero(np.tile([not midsagittal, True, True], len(roles)))
+        self._axes = np.flatnonzero(np.tile([not midsagittal, True, True], len(roles))).astype(np.int64)
         self.noise_mm = MODEL_NOISE_MM
+        self._at_places: dict[Places, tuple[FloatArray, FloatArray]] = {}
         self._summarise(_near_their_medians(self._coils))
 
     def _summarise(self, kept: NDArray[np.bool_]) -> None:
@@ -375,13 +441,11 @@ class _Posterior:
 
     def _rigid(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation and translation from the guess's frame to the model's."""
-        from scipy.spatial.transform import Rotation
-
         turn = np.zeros(3)
         turn[: self.size - self._shifts] = unknowns[self._shifts : self.size]
         shift = np.zeros(3)
         shift[-self._shifts :] = unknowns[: self._shifts]
-        rotation = np.asarray(Rotation.from_rotvec(turn).as_matrix())
+        rotation = rotation_about(turn)
         return rotation, self._centre - rotation @ self._centre + shift
 
     def whole_motion(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -413,15 +477,13 @@ class _Posterior:
     def value(self, unknowns: FloatArray, places: Places, noise_mm: float) -> float:
         """J with another noise."""
         own, self.noise_mm = self.noise_mm, noise_mm
-        value = self._value_and_slope(unknowns, self._model.at(places), places)[0]
+        value = self._value_and_slope(unknowns, places)[0]
         self.noise_mm = own
         return value
 
-    def _value_and_slope(
-        self, unknowns: FloatArray, at_coils: TongueModel, places: Places
-    ) -> tuple[float, FloatArray]:
+    def _value_and_slope(self, unknowns: FloatArray, places: Places) -> tuple[float, FloatArray]:
         """J, and its derivatives in the speaker (in measured sigma), without the palate's."""
-        frame = self._frame_terms(unknowns, at_coils, self.noise_mm)
+        frame = self._frame_terms(unknowns, places, self.noise_mm)
         speaker = unknowns[self.size :]
         value = self._independent_frames * frame.value + 0.5 * float(speaker @ speaker)
         value += 0.5 * float(np.sum((unknowns[: self.size] / self._sd) ** 2))
@@ -431,39 +493,33 @@ class _Posterior:
                 slid = self._along[places[index]] - USUAL_PLACES_MM["tongue_tip"]
                 value += 0.5 * (slid / TIP_PLACE_SD_MM) ** 2
         if self._palate is not None:
-            worst = np.sort(self._heights(unknowns, frame))[-max(1, round(WORST_SHARE * len(self.shown))) :]
+            heights = np.sort(self._heights(unknowns, frame))
+            worst = heights[-max(1, round(WORST_SHARE * len(heights))) :]
             value += 0.5 * (float(np.maximum(worst, 0.0).mean()) / PALATE_SD_MM) ** 2
         return value, self._independent_frames * frame.slope * self._speaker_sd + speaker
 
-    def _frame_terms(self, unknowns: FloatArray, at_coils: TongueModel, noise_mm: float) -> _FrameTerms:
+    def _frame_terms(self, unknowns: FloatArray, places: Places, noise_mm: float) -> FrameTerms:
         """The mean over the frames of their negative log likelihood, up to a constant."""
+        if places not in self._at_places:
+            seen = self._model.at(places)
+            self._at_places[places] = (
+                np.array(seen.core[:, :, self._axes], order="C"), np.array(seen.origin[self._axes]),
+            )  # fmt: skip
+        core, origin = self._at_places[places]
         rotation, translation = self._rigid(unknowns)
-        turned = np.kron(np.eye(len(self._roles)), rotation)
-        middle = (turned @ self._middle_of_frames + np.tile(translation, len(self._roles)))[self._axes]
-        spread = (turned @ self._spread @ turned.T)[np.ix_(self._axes, self._axes)]
-        core = at_coils.core[:, :, self._axes]
-        directions = np.tensordot(self.speaker(unknowns), core, axes=1)  # (n, axes)
-        answering = self._pose_covariance @ directions
-        off = middle - at_coils.origin[self._axes] - self._pose_mean @ directions
-        expected = directions.T @ answering + noise_mm**2 * np.eye(len(off))
-        inverse = np.linalg.inv(expected)
-        pull = inverse @ off
-        value = 0.5 * float(np.sum(inverse * spread) + off @ pull + np.linalg.slogdet(expected)[1])
-        narrower = inverse - inverse @ spread @ inverse - np.outer(pull, pull)
-        by_direction = answering @ narrower - np.outer(self._pose_mean, pull)
-        gain = answering @ inverse  # pose = mean + gain @ (coils - expected)
-        return _FrameTerms(
-            value, np.tensordot(core, by_direction, axes=2), off - middle, gain, inverse, directions
-        )
+        return mean_frame(
+            core, origin, self.speaker(unknowns), self._pose_mean, self._pose_covariance, self._middle_of_frames,
+            self._spread, rotation, translation, self._axes, noise_mm,
+        )  # fmt: skip
 
-    def _poses(self, unknowns: FloatArray, frame: _FrameTerms) -> FloatArray:
+    def _poses(self, unknowns: FloatArray, frame: FrameTerms) -> FloatArray:
         """(T, n) the poses of the shown frames that the coils make most probable."""
         coils = self.moved(unknowns).reshape(len(self.shown), -1)[:, self._axes]
         return np.asarray(self._pose_mean + (coils + frame.off) @ frame.gain.T)
 
-    def _heights(self, unknowns: FloatArray, frame: _FrameTerms) -> FloatArray:
-        contours = _shapes(self._contour, self.speaker(unknowns), self._poses(unknowns, frame))
-        return self.heights(contours, unknowns)
+    def _heights(self, unknowns: FloatArray, frame: FrameTerms) -> FloatArray:
+        some = self._poses(unknowns, frame)[::PALATE_STRIDE]
+        return self.heights(_shapes(self._contour, self.speaker(unknowns), some), unknowns)
 
     def heights(self, contours: FloatArray, unknowns: FloatArray) -> FloatArray:
         """(T,) mm by which contours (T, c, 3) rise above the palate at the most; minus infinity without overlap."""
@@ -484,7 +540,9 @@ class _Posterior:
             unknowns, _ = self._descend(unknowns, places)
             found = self._slid(unknowns, places)
             if found == places and noise == self.noise_mm:
-                break
+                found = self._slid_by_one(unknowns, places) if adaptive else places
+                if found == places:
+                    break
             places = found
         unknowns, value = self._descend(unknowns, places)
         return _Found(unknowns, places, value)
@@ -499,18 +557,17 @@ class _Posterior:
         from scipy.optimize import minimize
 
         scaling = np.diag(self._units) if scaling is None else scaling
-        at_coils = self._model.at(places)
         by_differences = self.size if self._palate is None else len(unknowns)
 
         def value_and_slope(scaled: FloatArray) -> tuple[float, FloatArray]:
             here = unknowns + scaling @ scaled
-            value, speaker_slope = self._value_and_slope(here, at_coils, places)
+            value, speaker_slope = self._value_and_slope(here, places)
             slope = np.concatenate([np.zeros(self.size), speaker_slope])
             for index in range(by_differences):
                 there = here.copy()
                 step = DIFFERENCE * self._units[index]
                 there[index] += step
-                slope[index] = (self._value_and_slope(there, at_coils, places)[0] - value) / step
+                slope[index] = (self._value_and_slope(there, places)[0] - value) / step
             return value, scaling.T @ slope
 
         end = minimize(
@@ -524,14 +581,7 @@ class _Posterior:
 
     def _slid(self, unknowns: FloatArray, places: Places) -> Places:
         """The places after sliding coils along the contour; motion and speaker follow each trial."""
-        known: dict[Places, float] = {}
-        scaling = np.linalg.cholesky(self._covariance(unknowns, places))
-
-        def cost(trial: Places) -> float:
-            if trial not in known:
-                known[trial] = self._descend(unknowns, trial, TRIAL_STEPS, scaling)[1]
-            return known[trial]
-
+        cost = self._cost_of_places(unknowns, places)
         places = slid_along_contour(places, self._middle, self._contour_size, cost)
         for stride in (4, 2, 1, 1):
             together = (self._all_slid(places, move) for move in (-stride, stride))
@@ -543,6 +593,31 @@ class _Posterior:
                 places = tuple(trial)
         return places
 
+    def _slid_by_one(self, unknowns: FloatArray, places: Places) -> Places:
+        """The best of the places where each mid-sagittal coil has slid by one vertex or not, in every combination."""
+        cost = self._cost_of_places(unknowns, places)
+        trials = [places]
+        for moves in product((-1, 0, 1), repeat=len(self._middle)):
+            trial = np.array(places)
+            trial[self._middle] += moves
+            slid = trial[self._middle]
+            if slid.min() >= 0 and slid.max() < self._contour_size and (np.diff(slid) > 0).all():
+                trials.append(tuple(int(place) for place in trial))
+        best = min(trials, key=cost)
+        return best if cost(best) < cost(places) - 1e-6 else places
+
+    def _cost_of_places(self, unknowns: FloatArray, places: Places) -> Callable[[Places], float]:
+        """J of other places nearby, to which motion and speaker follow; remembered."""
+        known: dict[Places, float] = {}
+        scaling = np.linalg.cholesky(self._covariance(unknowns, places))
+
+        def cost(trial: Places) -> float:
+            if trial not in known:
+                known[trial] = self._descend(unknowns, trial, TRIAL_STEPS, scaling)[1]
+            return known[trial]
+
+        return cost
+
     def _all_slid(self, places: Places, move: int) -> Places | None:
         """All mid-sagittal coils together, as a wrong motion along the tongue has them; None beyond the contour."""
         trial = list(places)
@@ -553,15 +628,14 @@ class _Posterior:
 
     def _nearest_on_surface(self, unknowns: FloatArray, places: Places, index: int) -> int:
         """The place on the upper surface that is nearest to a lateral coil on average over the frames."""
-        frame = self._frame_terms(unknowns, self._model.at(places), self.noise_mm)
+        frame = self._frame_terms(unknowns, places, self.noise_mm)
         shapes = _shapes(self._surface, self.speaker(unknowns), self._poses(unknowns, frame))
         apart = np.linalg.norm(shapes - self.moved(unknowns)[:, index][:, None], axis=2)
         return self._contour_size + int(np.argmin(apart.mean(axis=0)))
 
     def _adapt(self, unknowns: FloatArray, places: Places, least_noise_mm: float) -> None:
         """The frames that are no outliers, their poses, and the noise that makes them most probable."""
-        at_coils = self._model.at(places)
-        frame = self._frame_terms(unknowns, at_coils, self.noise_mm)
+        frame = self._frame_terms(unknowns, places, self.noise_mm)
         rotation, translation = self._rigid(unknowns)
         off = (self._coils @ rotation.T + translation).reshape(len(self._coils), -1)[
             :, self._axes
@@ -582,20 +656,19 @@ class _Posterior:
         self._pose_mean = mean
         self._pose_covariance = (1.0 - own) * believed + own * (away.T @ away / len(away) + unsure)
         noises = NOISES_MM[NOISES_MM >= least_noise_mm]
-        likely = [self._frame_terms(unknowns, at_coils, noise).value for noise in noises]
+        likely = [self._frame_terms(unknowns, places, noise).value for noise in noises]
         self.noise_mm = float(noises[int(np.argmin(likely))])
 
     def _covariance(self, unknowns: FloatArray, places: Places) -> FloatArray:
         """(k, k) of the unknowns, from the curvature of J there; the vertices are held."""
         step = 0.1
         size = len(self._units)
-        at_coils = self._model.at(places)
 
         def at(*moves: tuple[int, float]) -> float:
             there = unknowns.copy()
             for index, by in moves:
                 there[index] += by * step * self._units[index]
-            return self._value_and_slope(there, at_coils, places)[0]
+            return self._value_and_slope(there, places)[0]
 
         middle = at()
         curvature = np.zeros((size, size))
@@ -619,19 +692,6 @@ class _Posterior:
     def deviations_from_guess(self, unknowns: FloatArray) -> FloatArray:
         """The motion in standard deviations of the guess."""
         return np.asarray(unknowns[: self.size] / self._sd)
-
-
-class _FrameTerms(NamedTuple):
-    """value: of the mean frame; slope: (m,) its derivatives in the raw speaker weights; off: (axes,) to be added to
-    coils for their deviation from what is expected; gain: (n, axes) of the pose; inverse: (axes, axes) of the
-    expected covariance; directions: (n, axes) d v / d p."""
-
-    value: float
-    slope: FloatArray
-    off: FloatArray
-    gain: FloatArray
-    inverse: FloatArray
-    directions: FloatArray
 
 
 def _measured_sigma(mode: Mode) -> FloatArray:
