@@ -334,3 +334,15 @@ def test_names_are_short_and_different(tmp_path):
 
 def test_a_recording_cannot_take_the_name_of_all_together(tmp_path):
     assert short_names([tmp_path / "all.pos", tmp_path / "b.pos"]) == ["all.pos", "b.pos"]
+
+
+def test_a_recording_that_is_not_in_the_models_frame_is_called_so(place, small_model, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    astray = recording(small_model, "", 60, 1)
+    astray.positions[:, :, 2] += 80.0
+    write_recording(astray, tmp_path / "astray.csv")
+    arguments = [str(tmp_path / "astray.csv"), "--model", str(place / "model.npz")]
+    assert main(["experiment", *arguments, "-o", str(tmp_path / "report")]) == 0
+    assert "warning: astray is on average" in capsys.readouterr().err
+    page = (tmp_path / "report" / "report.md").read_text(encoding="utf-8")
+    assert "it is not in the model's frame" in page

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -73,7 +73,7 @@ def draw_errors(experiments: Experiments) -> Figure:
     return figure
 
 
-def _draw_cumulative(axes: Axes, errors: FloatArray, colour: str, **style: object) -> None:
+def _draw_cumulative(axes: Axes, errors: FloatArray, colour: str, **style: Any) -> None:
     """A step at each error; beyond the largest it stays at 1."""
     ordered = np.concatenate([[0.0], np.sort(errors), [1e6]])
     shares = np.concatenate([[0.0], np.arange(1, len(errors) + 1) / len(errors), [1.0]])
@@ -122,8 +122,8 @@ def _draw_violins(panel: Axes, columns: list[FloatArray], colour: str) -> None:
     spread = [(place, column) for place, column in enumerate(thinned, 1) if np.ptp(column) > 1e-9]
     if spread:
         places, drawn = zip(*spread, strict=True)
-        parts = panel.violinplot(drawn, places, widths=0.8, showextrema=False)
-        for body in parts["bodies"]:
+        bodies: Any = panel.violinplot(drawn, places, widths=0.8, showextrema=False)["bodies"]
+        for body in bodies:
             body.set(facecolor=colour, edgecolor=colour, alpha=0.35)
     panel.hlines([column.mean() for column in columns], *_about(len(columns), 0.3), color=colour, linewidth=2)
     for quartile in (25, 75):

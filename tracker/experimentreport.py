@@ -12,6 +12,7 @@ from typing import Any
 from .. import __version__
 from ..model.multilinear import TongueModel
 from .experiments import Anatomy, Experiments, Spread, Statistics, pooled, statistics_of
+from .status import MISPLACED_MM
 
 TABLE_FILES = ("statistics.json", "statistics.csv", "report.md")
 NO_FILMS = "Films of the tracked tongue are not written: there is no renderer yet."
@@ -49,7 +50,18 @@ def describe_anatomy(anatomy: Anatomy, model: TongueModel) -> str:
     else:
         pairs = zip(weights, anatomy.sigma, strict=True)
         shown = ", ".join(f"{weight:+.2f} +- {sigma:.2f}" for weight, sigma in pairs)
-    return f"{anatomy.source}; in sigma {shown}"
+    noise = " (+- from the noise alone)" if anatomy.sigma is not None else ""
+    return f"{anatomy.source}; in sigma {shown}{noise}"
+
+
+def misplaced(statistics: dict[str, Pair]) -> list[str]:
+    """A warning for each recording whose residuals say that it is not where the model is."""
+    return [
+        f"warning: {name} is on average {first.error_mm.mean:.1f} mm off even with anatomy and pose free: it is not in "
+        "the model's frame (see [alignment] in docs/session.md), and its weights mean nothing"
+        for name, (first, _) in statistics.items()
+        if first.error_mm.mean > MISPLACED_MM and name != ALL
+    ]
 
 
 # Tables for people ----------------------------------------------------------------------------------
@@ -116,6 +128,7 @@ def report_page(experiments: Experiments, statistics: dict[str, Pair], features:
         _WHAT.format(version=__version__),
         _set_up(experiments),
         NO_FILMS,
+        *misplaced(statistics),
         *_error_section(experiments, statistics),
         *_weight_section(experiments, statistics),
     ]

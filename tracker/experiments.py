@@ -114,15 +114,18 @@ def run_experiments(
         setups.append(setup)
         free.append(run.experiment_1)
     found = _anatomy(model, setups[0], free, anatomy)
-    speaker = {"speaker_weights": found.weights, "speaker_source": found.source}
     takes = []
     for (name, recording), setup, first in zip(recordings, setups, free, strict=True):
-        fixed = replace(setup, session=replace(setup.session, **speaker))
+        fixed = replace(setup, session=_with_speaker(setup.session, found))
         second = track_recording(recording, model, experiments=(2,), setup=fixed).experiment_2
         assert second is not None
         takes.append(Take(name, first, second, recording.notes))
-    complete = replace(setups[0].session, **speaker)
+    complete = _with_speaker(setups[0].session, found)
     return Experiments(model, complete, found, tuple(takes), setups[0].decisions)
+
+
+def _with_speaker(session: Session, anatomy: Anatomy) -> Session:
+    return replace(session, speaker_weights=anatomy.weights, speaker_source=anatomy.source)
 
 
 def _like_the_first(setup: Setup, session: Session) -> Session:

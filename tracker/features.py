@@ -90,9 +90,13 @@ def features_of(poses: TrackedPoses, rate_hz: float) -> Features:
     first = deltas(static)
     second = deltas(first)
     return Features(
-        times,
-        *(part[:, :size] for part in (static, first, second)),
-        *(part[:, size:] for part in (static, first, second)),
+        times_s=times,
+        weights=static[:, :size],
+        weights_delta=first[:, :size],
+        weights_delta_delta=second[:, :size],
+        normalised=static[:, size:],
+        normalised_delta=first[:, size:],
+        normalised_delta_delta=second[:, size:],
         rate_hz=rate_hz,
     )
 
@@ -142,7 +146,7 @@ def deltas(values: FloatArray) -> FloatArray:
     """
     result = np.full_like(values, np.nan)
     scale = 2.0 * sum(n * n for n in range(1, REACH + 1))
-    for run in runs_of(~np.isnan(values).any(axis=1)):
+    for run in runs_of(np.asarray(~np.isnan(values).any(axis=1))):
         length = run.stop - run.start
         wide = np.pad(values[run], ((REACH, REACH), (0, 0)), mode="edge")
         later = (wide[REACH + n : REACH + n + length] for n in range(1, REACH + 1))

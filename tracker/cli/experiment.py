@@ -61,6 +61,7 @@ def run_experiment(args: argparse.Namespace) -> int:
         describe_anatomy,
         describe_model,
         json_text,
+        misplaced,
         report_page,
         text_table,
     )
@@ -97,6 +98,8 @@ def run_experiment(args: argparse.Namespace) -> int:
     print(f"  anatomy of experiment 2: {describe_anatomy(done.anatomy, model)}", file=sys.stderr)
 
     statistics = all_statistics(done)
+    for warning in misplaced(statistics):
+        print(f"  {warning}", file=sys.stderr)
     numbers = json_text(done, statistics)
     page = report_page(done, statistics, features)
     tables = (numbers.encode(), as_csv(statistics).encode(), page.encode())
