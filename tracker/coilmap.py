@@ -131,6 +131,7 @@ def guess_coil_map(coils: Sequence[str], positions: FloatArray, source: str) -> 
     roles = dict(zip(ordered, TONGUE_ROLES[len(ordered)], strict=True))
     for role, names in {**_LATERAL_NAMES, **_OTHER_NAMES}.items():
         for name in coils:
-            if simple[name] in names and name in live and role not in roles.values():
+            named = simple[name] in names or name == role
+            if named and name in live and role not in roles.values():
                 roles[name] = role
     return CoilMap(roles, "channel names, ordered by distance from the tip coil")
