@@ -91,6 +91,8 @@ DOCS = {
     ".venv/bin/tonguetrack track recordings/demo.csv --out poses.csv --save-session session.toml": HERE,
     ".venv/bin/tonguetrack mesh poses.csv --frame 100 -o tongue.ply": HERE,
     ".venv/bin/tonguetrack mesh poses.csv --every 50 -o tongue.ply": HERE,
+    ".venv/bin/tonguetrack experiment recordings/demo.csv -o report/": HERE,
+    ".venv/bin/tonguetrack experiment recordings/demo.csv --features 200 --anatomy joint -o report/": HERE,
     ".venv/bin/tonguetrack convert recordings/demo.csv demo.npz": HERE,
     ".venv/bin/tonguetrack model build PATH/sampleDatabase.yaml -o ultrax.npz": WITH_REFERENCE,
     ".venv/bin/tonguetrack model info bundled": HERE,
@@ -144,6 +146,7 @@ def test_the_flags_that_pages_name_exist():
     for command in (
         "demo",
         "track",
+        "experiment",
         "mesh",
         "info",
         "convert",
