@@ -21,7 +21,7 @@ TONGUETRACK = [sys.executable, "-c", "import sys; from tonguetrack.tracker.cli i
 @pytest.fixture(scope="module")
 def sweep():
     """A speaker with reference coils, whose head moves."""
-    phones = tuple(["ə", "i", "ə", "ɑ", "ə", "u", "ə", "s", "a", "ʃ", "i", "ɔ", "ə"])
+    phones = ("ə", "i", "ə", "ɑ", "ə", "u", "ə", "s", "a", "ʃ", "i", "ɔ", "ə")
     recording, _ = simulate(
         Simulation(phones, (*TONGUE, *HEAD_COILS), seconds=12.0, rate_hz=100.0, head_motion=True)
     )
