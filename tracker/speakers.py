@@ -265,17 +265,20 @@ def first_speech(coils: FloatArray, rate_hz: float, seconds: float) -> slice:
     """
     if not 0.0 < seconds < np.inf:
         raise InputError(f"--seconds {seconds:g}: expected a number of seconds above 0.")
+    length = max(1, round(seconds * rate_hz))
+    if len(coils) < 2:
+        return slice(0, len(coils))
     moved = np.linalg.norm(np.diff(coils, axis=0), axis=2)
     known = np.isfinite(moved)
     counts = known.sum(axis=1)
-    window = np.ones(max(1, round(SMOOTHED_S * rate_hz)))
+    window = np.ones(min(max(1, round(SMOOTHED_S * rate_hz)), len(moved)))
     total = np.convolve(np.where(known, moved, 0.0).sum(axis=1), window, "same")
     number = np.convolve(counts, window, "same")
     speed = np.where(number > 0, total / np.maximum(number, 1), 0.0)
-    # A recording that stands still, as one of synthetic holds, begins with its first frame.
-    speaking = np.flatnonzero(speed > SPEAKING * np.quantile(speed, 0.9)) if len(speed) else speed
+    # A recording that stands still begins with its first frame.
+    speaking = np.flatnonzero(speed > SPEAKING * np.quantile(speed, 0.9))
     start = int(speaking[0]) if len(speaking) else 0
-    return slice(start, min(start + max(1, round(seconds * rate_hz)), len(coils)))
+    return slice(start, min(start + length, len(coils)))
 
 
 # Comparing --------------------------------------------------------------------------------------------
@@ -288,7 +291,7 @@ def differences(model: TongueModel, results: Mapping[str, SpeakerResult]) -> tup
         apart = (results[one].weights - results[other].weights) / model.speaker.sigma
         error = np.hypot(results[one].sigma, results[other].sigma)
         found.extend(
-            Difference(one, other, weight + 1, float(apart[weight]), float(error[weight]))
+            Difference(one, other, int(weight) + 1, float(apart[weight]), float(error[weight]))
             for weight in np.flatnonzero(np.abs(apart) > SURE * error)
         )
     return tuple(found)
