@@ -54,6 +54,7 @@ INCISOR_COIL_MM = (0.0, -2.0, 4.0)  # of the coil on the gum above the upper inc
 FAR_FROM_MOUTH_MM = 40.0  # a tongue so far from where it lies in a model belongs to another bite plane
 PALATE_ALLOWED_MM = 1.0
 NEVER_MOVED_MM = 0.05
+LITTLE_MOVEMENT_MM = 2.0  # standard deviation of tongue coils; speech has 4 and more
 EXPERIMENTS = (1, 2)
 # Channel names on a bite plate, lower case, separators removed.
 _BITE_NAMES = {
@@ -143,6 +144,11 @@ class Calibration:
         fit = self.registration
         return {
             "decisions": list(self.decisions),
+            "first_guess": {
+                "rotation": self.base_rotation.tolist(),
+                "translation_mm": self.base_translation_mm.tolist(),
+                "source": self.guess.source,
+            },
             "rotation": self.session.alignment.rotation.tolist(),
             "translation_mm": self.session.alignment.translation_mm.tolist(),
             "sure": fit.sure.tolist(),
@@ -193,6 +199,12 @@ def calibrate(
         raise InputError(
             f"{first.source}: no frame has all tongue coils ({', '.join(coil_map.tongue)}); leave out the one without "
             "data with --coils."
+        )
+    moving = float(np.nanmean(np.nanstd(still, axis=0)) * np.sqrt(3.0))
+    if moving < LITTLE_MOVEMENT_MM:
+        told.append(
+            f"note: the tongue coils move by only {moving:.1f} mm (standard deviation), so they say little about alignment "
+            "and anatomy; take a recording of varied speech"
         )
     base = _base(recordings, session, axes, sources, others, still, roles, told)
     two_dimensional = axes is not None and "absent" in (axes.x, axes.y, axes.z)

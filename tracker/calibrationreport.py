@@ -130,7 +130,9 @@ def draw_views(calibration: Calibration, model: TongueModel) -> Figure:
     for row, (name, coils, above, shape) in zip(panels, states, strict=True):
         for panel, axis, side in zip(row, (1, 0), ("from the side", "from the front"), strict=True):
             _clouds(panel, coils, calibration.roles, axis)
-            panel.plot(shape[:, axis], shape[:, 2], color="black", label="model")
+            # From the front, the contour is the plane that it lies in: the mesh zigzags about it.
+            across = shape[:, 1] if axis == 1 else np.zeros(len(shape))
+            panel.plot(across, shape[:, 2], color="black", label="model")
             if above is not None:
                 panel.plot(above[:, axis], above[:, 2], color="0.45", linewidth=2.5, label="palate")
             panel.set_title(f"{name}, {side}")
@@ -139,7 +141,7 @@ def draw_views(calibration: Calibration, model: TongueModel) -> Figure:
             panel.grid(color="0.92")
         row[0].set_ylabel("z (up), mm")
     handles, names = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=6, frameon=False)
+    figure.legend(handles, names, loc="outside lower center", ncols=6, frameon=False, markerscale=5)
     return figure
 
 
@@ -161,7 +163,7 @@ def draw_contours(calibration: Calibration, model: TongueModel) -> Figure:
         title = _palate_title(calibration, palate)
     panel.set_title(title)
     _side_view(panel)
-    panel.legend(frameon=False)
+    panel.legend(frameon=False, markerscale=5)
     return figure
 
 
@@ -169,8 +171,8 @@ def _palate_title(calibration: Calibration, palate: Palate) -> str:
     figures = calibration.after[2]
     span = float(np.ptp(palate.curve[0]))
     return (
-        f"experiment 2: {100 * figures.above_palate:.1f} % of the frames more than {PALATE_ALLOWED_MM:g} mm above the palate, "
-        f"99 % stay below {figures.highest_mm:+.1f} mm (palate of {span:.0f} mm)"
+        f"experiment 2 under a palate of {span:.0f} mm: {100 * figures.above_palate:.1f} % of the frames more than "
+        f"{PALATE_ALLOWED_MM:g} mm above it,\n99 % stay below {figures.highest_mm:+.1f} mm"
     )
 
 

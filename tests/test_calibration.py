@@ -1,0 +1,342 @@
+"""`tonguetrack calibrate`: what it finds on recordings whose truth is known, and what it refuses."""
+
+import contextlib
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tonguetrack import InputError
+from tonguetrack.drivers import FrameOfReference, Recording, open_recording, write_recording
+from tonguetrack.model.files import save_model
+from tonguetrack.tracker.bundled import bundled_model
+from tonguetrack.tracker.calibration import Sources, calibrate
+from tonguetrack.tracker.calibrationreport import REPORT_FILES
+from tonguetrack.tracker.cli import main
+from tonguetrack.tracker.headcorrection import head_motion
+from tonguetrack.tracker.session import Alignment, load_session
+from tonguetrack.tracker.setup import preparation_of
+from tonguetrack.tracker.simulation import HEAD_COILS, Simulation, simulate
+from tonguetrack.tracker.tracking import track_recording
+
+TONGUE = ("tongue_tip", "tongue_blade", "tongue_dorsum")
+HEAD = tuple(HEAD_COILS)
+PLATE = {"bite_front": (0.0, 0.0, 0.0), "bite_left": (22.0, 36.0, 0.0), "bite_right": (-22.0, 36.0, 0.0)}
+RATE_HZ = 250.0
+# The file: mirrored ("right back up"), then turned by 12 degrees and shifted; file = TURN @ model + SHIFT.
+TURN = Rotation.from_rotvec(np.radians([8.0, -6.0, 6.0])).as_matrix() @ np.diag([-1.0, 1.0, 1.0])
+SHIFT = np.array([120.0, -40.0, 300.0])
+SLIPPED_S = (2.0, 3.0)
+
+
+def in_the_file(positions):
+    return positions @ TURN.T + SHIFT
+
+
+def recording_of(roles, positions, name):
+    frames = len(positions)
+    return Recording(tuple(roles), positions, np.arange(frames) / RATE_HZ, RATE_HZ, "test", source=name)
+
+
+def held_still(places, frames, random, turned_deg=7.0):
+    """(frames, n, 3): places of the model's frame on a head that is turned and shifted, with noise, in the file."""
+    turn = Rotation.from_rotvec(np.radians([turned_deg, 2.0, -3.0])).as_matrix()
+    there = np.array(places) @ turn.T + [3.0, -5.0, 4.0]
+    return in_the_file(there) + random.normal(scale=0.3, size=(frames, len(places), 3))
+
+
+def vault(back):
+    """Height of a palate above the simulated tongues, mm, at mm behind the incisors."""
+    return 17.0 - 0.012 * (back - 32.0) ** 2
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A take with head motion, 5 % dropouts and a slipping reference; a bite plate, a palate sweep, a bad plate."""
+    place = tmp_path_factory.mktemp("calibration")
+    take, truth = simulate(
+        Simulation(
+            ("ə", "i", "ɑ", "u", "s", "a", "ʃ", "ɔ"),
+            (*TONGUE, *HEAD),
+            seconds=4.0,
+            dropouts=0.05,
+            head_motion=True,
+        )
+    )
+    positions = take.positions.copy()
+    slipped = (take.times_s >= SLIPPED_S[0]) & (take.times_s < SLIPPED_S[1])
+    positions[slipped, take.coils.index("head_left")] += [0.0, 8.0, 5.0]
+    turned = replace(take, positions=in_the_file(positions), frame=FrameOfReference())
+    write_recording(turned, place / "take.npz")
+
+    random = np.random.default_rng(3)
+    roles = (*PLATE, *HEAD)
+    places = [*PLATE.values(), *HEAD_COILS.values()]
+    write_recording(recording_of(roles, held_still(places, 200, random), "bite"), place / "bite.npz")
+    other = np.array(places)
+    other[len(PLATE) :] *= 1.12
+    write_recording(recording_of(roles, held_still(other, 200, random), "other"), place / "other.npz")
+
+    back = np.concatenate([np.linspace(4.0, 50.0, 500), np.linspace(50.0, 4.0, 500)])
+    for name, lower_mm in (("palate", 0.0), ("low", 14.0)):
+        probe = np.column_stack([np.zeros(1000), back, vault(back) - lower_mm])
+        paths = np.stack([probe, *(np.tile(HEAD_COILS[role], (1000, 1)) for role in HEAD)], axis=1)
+        noisy = in_the_file(paths) + random.normal(scale=0.3, size=paths.shape)
+        write_recording(recording_of(("palate_probe", *HEAD), noisy, name), place / f"{name}.npz")
+    return place, truth
+
+
+@pytest.fixture(scope="module")
+def calibrated(files):
+    """What one run of the command says and writes: (folder, truth, JSON, decisions)."""
+    place, truth = files
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main(
+            [
+                *("calibrate", str(place / "take.npz"), "--bite-plane", str(place / "bite.npz")),
+                *(
+                    "--palate",
+                    str(place / "palate.npz"),
+                    "--frame",
+                    "right back up",
+                    "--smoothing",
+                    "carstens",
+                ),
+                *("-o", str(place / "session.toml"), "--report", str(place / "report"), "--json"),
+            ]
+        )
+    assert code == 0, err.getvalue()
+    return place, truth, json.loads(out.getvalue()), err.getvalue()
+
+
+def rigid(points, onto):
+    """Rotation (mirroring where that is nearer) and translation with onto = rotation @ points + translation."""
+    left, _, right = np.linalg.svd((onto - onto.mean(axis=0)).T @ (points - points.mean(axis=0)))
+    rotation = left @ right
+    return rotation, onto.mean(axis=0) - rotation @ points.mean(axis=0)
+
+
+def degrees_between(first, second):
+    return np.degrees(Rotation.from_matrix(first @ np.swapaxes(second, -1, -2)).magnitude())
+
+
+def true_alignment(session):
+    """From the head's rest in the file to the model's frame: all references lie within 0.1 mm of a rigid head."""
+    rotation, translation = rigid(
+        session.head.positions_mm, np.array([HEAD_COILS[r] for r in session.head.roles])
+    )
+    return rotation, translation
+
+
+def test_the_head_at_rest_has_the_true_shape(calibrated):
+    session = load_session(calibrated[0] / "session.toml")
+    assert set(session.head.roles) == set(HEAD)
+    rotation, translation = true_alignment(session)
+    off = session.head.positions_mm @ rotation.T + translation - [HEAD_COILS[r] for r in session.head.roles]
+    assert np.linalg.norm(off, axis=1).max() < 0.15
+    assert np.linalg.det(rotation) < 0
+
+
+def test_the_heads_motion_is_found_to_0_3_mm_and_half_a_degree_though_a_reference_slips(calibrated):
+    place, truth, _, _ = calibrated
+    session = load_session(place / "session.toml")
+    take = open_recording(place / "take.npz")
+    unaligned = replace(session, alignment=Alignment())
+    still = preparation_of(take.coils, TONGUE, TONGUE, unaligned, take.rate_hz).all_frames(
+        take.positions, RATE_HZ
+    )
+    rotation, translation = true_alignment(session)
+    # Noise of single samples is no error of the motion: 15 frames are averaged.
+    off = still @ rotation.T + translation - truth.positions[:, : len(TONGUE)]
+    smooth = np.stack([np.nanmean(off[begin : begin + 15], axis=0) for begin in range(0, len(off) - 15, 15)])
+    assert np.nanquantile(np.linalg.norm(smooth, axis=2), 0.9) < 0.6
+    assert np.nanmedian(np.linalg.norm(smooth, axis=2)) < 0.3
+    channels = [take.coils.index(role) for role in session.head.roles]
+    motion = head_motion(take.positions[:, channels], session.head, RATE_HZ)
+    expected = TURN @ truth.head_rotation @ rotation
+    assert np.median(degrees_between(motion.rotations, expected)) < 0.5
+
+
+def test_the_bite_plane_gives_the_models_frame_to_0_3_mm_and_half_a_degree(calibrated):
+    place, _, told, _ = calibrated
+    rotation, translation = true_alignment(load_session(place / "session.toml"))
+    found = np.array(told["first_guess"]["rotation"])
+    assert np.linalg.det(found) < 0
+    assert degrees_between(found, rotation) < 0.5
+    incisors = np.linalg.solve(rotation, -translation)
+    shift = found @ incisors + told["first_guess"]["translation_mm"]
+    assert np.linalg.norm(shift) < 0.3
+
+
+def test_the_fit_to_the_model_stays_within_what_it_says_of_itself(calibrated):
+    """A synthetic stranger is not in the model, so the fit trades millimetres for a likelier anatomy: 3 sd at most."""
+    place, _, told, _ = calibrated
+    session = load_session(place / "session.toml")
+    rotation, translation = true_alignment(session)
+    middle = np.linalg.solve(rotation, np.array([0.0, 27.0, 0.0]) - translation)
+    shift = session.alignment.rotation @ middle + session.alignment.translation_mm - [0.0, 27.0, 0.0]
+    sure_y, sure_z, sure_pitch = told["sure"]
+    assert abs(shift[1]) < 3 * sure_y and abs(shift[2]) < 3 * sure_z
+    assert degrees_between(session.alignment.rotation, rotation) < 3 * sure_pitch
+    assert np.linalg.norm(shift) < 4.0
+
+
+def test_the_session_loads_again_and_gives_the_same_poses(calibrated):
+    place, _, told, _ = calibrated
+    session = load_session(place / "session.toml")
+    take = open_recording(place / "take.npz")
+    poses = track_recording(take, bundled_model(), session, (2,)).experiment_2
+    after = told["after"]["experiment_2"]
+    assert poses.residual_mm[poses.tracked].mean() == pytest.approx(after["residual_mean_mm"], abs=1e-12)
+    assert after["frames"] == int(poses.tracked.sum()) > 900
+    assert session.smoothing.preset == "carstens" and session.alignment.midsagittal
+    assert "bite.npz" in session.alignment.source and "palate" in session.alignment.source
+    assert session.speaker_source.startswith("joint estimate")
+
+
+def test_the_palate_is_where_it_was_swept_and_bounds_the_contours(calibrated):
+    place, _, told, _ = calibrated
+    session = load_session(place / "session.toml")
+    assert told["after"]["experiment_2"]["above_palate"] < 0.01
+    rotation, translation = true_alignment(session)
+    # Back from the model's frame, by the inverse alignment, to the head at rest and from there to the truth.
+    alignment = session.alignment
+    rest = (session.palate.points_mm - alignment.translation_mm) @ alignment.rotation
+    true = rest @ rotation.T + translation
+    assert np.abs(true[2:-2, 2] - vault(true[2:-2, 1])).max() < 0.5
+
+
+def test_every_decision_is_told(calibrated):
+    _, _, told, words = calibrated
+    slip = next(one for one in told["decisions"] if "slipped" in one)
+    assert "head_left" in slip and "2.0" in slip
+    for part in ("left-handed", "smoothing: carstens", "bite plane: occlusal frame", "same head", "correspondences",
+                 "experiment 2 with this session", "within 3 sigma"):  # fmt: skip
+        assert part in words, part
+
+
+def test_the_report_has_its_page_and_its_pictures(calibrated):
+    report = calibrated[0] / "report"
+    for name in REPORT_FILES:
+        assert (report / name).stat().st_size > 1000, name
+    page = (report / "report.md").read_text(encoding="utf-8")
+    for name in REPORT_FILES[1:]:
+        assert f"({name})" in page
+        assert (report / name).read_bytes()[:4] == b"\x89PNG"
+    assert "head_left slipped" in page
+
+
+# What is refused ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def refused(files, capsys, tmp_path, small_model):
+    """Runs the command that has to fail; the sentence that it prints."""
+    place, _ = files
+    save_model(small_model, tmp_path / "model.npz")
+
+    def run(*arguments, take="take.npz", frame=("--frame", "right back up")):
+        written = tmp_path / "session.toml"
+        given = [str(place / one) if one.endswith(".npz") else one for one in arguments]
+        code = main(
+            [
+                *("calibrate", str(place / take), "--model", str(tmp_path / "model.npz"), *frame),
+                *(*given, "-o", str(written)),
+            ]
+        )
+        assert code == 2
+        assert not written.exists()
+        printed = capsys.readouterr()
+        assert printed.out == ""
+        return printed.err.splitlines()[-1]
+
+    return run
+
+
+def test_axes_that_nobody_states_are_asked_for(refused):
+    said = refused(frame=())
+    assert "take.npz" in said and '--frame "front left up"' in said and "--bite-plane" in said
+
+
+def test_a_bite_plane_of_another_speaker(refused):
+    said = refused("--bite-plane", "other.npz")
+    assert "other.npz" in said and "take.npz" in said and "different speakers" in said
+
+
+def test_a_palate_below_the_tongue(refused):
+    said = refused("--palate", "low.npz", "--bite-plane", "bite.npz")
+    assert "low.npz" in said and "below the tongue" in said and "take.npz" in said
+
+
+def test_reference_coils_on_a_line(files, small_model):
+    place, _ = files
+    take = open_recording(place / "take.npz")
+    positions = take.positions.copy()
+    left, right = (take.coils.index(role) for role in ("head_left", "head_right"))
+    positions[:, take.coils.index("head_nose")] = 0.5 * (positions[:, left] + positions[:, right])
+    roles = {role: role for role in (*TONGUE, "head_nose", "head_left", "head_right")}
+    frame = FrameOfReference("right", "back", "up")
+    still = replace(take, positions=positions[: int(SLIPPED_S[0] * RATE_HZ)], times_s=take.times_s[:500])
+    with pytest.raises(InputError, match="head_nose, head_left, head_right lie on one line"):
+        calibrate([still], small_model, coils=roles, frame=frame)
+
+
+def test_a_channel_that_is_named_twice(refused):
+    said = refused("--coils", "tongue_tip=tongue_tip,tongue_tip=jaw")
+    assert "'tongue_tip' is named twice, as tongue_tip and as jaw" in said
+
+
+def test_a_role_that_is_given_twice(refused):
+    assert "given to 'tongue_tip' and to 'tongue_blade'" in refused(
+        "--coils", "tongue_tip=tongue_tip,tongue_blade=tongue_tip"
+    )
+
+
+def test_no_coil_on_the_tongue(refused):
+    assert "no channel has a tongue role" in refused("--coils", "head_nose=head_nose")
+
+
+def test_a_channel_that_the_recording_does_not_have(refused):
+    said = refused("--coils", "TT=tongue_tip")
+    assert "'TT'" in said and "its channels are tongue_tip, " in said
+
+
+@pytest.mark.parametrize("interval", ["3:9", "9:12", "2:1"])
+def test_a_rest_interval_outside_the_recording(refused, interval):
+    said = refused("--rest", interval)
+    assert f"--rest {interval}" in said and "from 0 to 4 s" in said
+
+
+def test_a_rest_interval_without_reference_coils(refused):
+    said = refused("--rest", "0:1", "--coils", "tongue_tip=tongue_tip,head_nose=head_nose")
+    assert "only 1 of at least 3" in said
+
+
+def test_words_that_are_no_interval(refused):
+    assert "START:END" in refused("--rest", "soon")
+
+
+def test_a_palate_sweep_without_the_reference_coils(files, small_model, tmp_path):
+    place, _ = files
+    sweep = open_recording(place / "palate.npz")
+    write_recording(replace(sweep, coils=("palate_probe", "a", "b", "c", "d")), tmp_path / "alone.npz")
+    take = open_recording(place / "take.npz")
+    with pytest.raises(InputError, match=r"alone.npz: it lacks the channel 'head_nose'"):
+        calibrate(
+            [take],
+            small_model,
+            Sources(palate=tmp_path / "alone.npz"),
+            frame=FrameOfReference("right", "back", "up"),
+        )
+
+
+def test_the_recording_is_never_overwritten(files, capsys):
+    place, _ = files
+    before = (place / "take.npz").read_bytes()
+    assert main(["calibrate", str(place / "take.npz"), "-o", str(place / "take.npz")]) == 2
+    assert "would be overwritten" in capsys.readouterr().err
+    assert (place / "take.npz").read_bytes() == before
