@@ -47,6 +47,8 @@ README = {
     ".venv/bin/tonguetrack track recordings/demo.csv --session session.toml --osc 127.0.0.1:9000 --realtime": HERE,
     ".venv/bin/tonguetrack convert recordings/demo.csv demo.json": HERE,
     ".venv/bin/tonguetrack simulate recording simulated.csv --seconds 4": HERE,
+    ".venv/bin/tonguetrack calibrate recordings/demo.csv -o placed.toml": HERE,
+    ".venv/bin/tonguetrack track recordings/demo.csv --session placed.toml --out placed.csv": HERE,
     ".venv/bin/tonguetrack doctor": ELSEWHERE + "test_doctor.py, where what is found may be anything",
     ".venv/bin/tonguetrack devices": HERE,
     WAVE
@@ -93,6 +95,11 @@ DOCS = {
     ".venv/bin/tonguetrack mesh poses.csv --every 50 -o tongue.ply": HERE,
     ".venv/bin/tonguetrack experiment recordings/demo.csv -o report/": HERE,
     ".venv/bin/tonguetrack experiment recordings/demo.csv --features 200 --anatomy joint -o report/": HERE,
+    ".venv/bin/tonguetrack anatomy recordings/demo.csv --session session.toml": HERE,
+    ".venv/bin/tonguetrack anatomy recordings/demo.csv --session session.toml --seconds 1"
+    " --save-session speaker.toml --use joint": HERE,
+    ".venv/bin/tonguetrack anatomy recordings/demo.csv --session session.toml"
+    " --mesh tongue_000500.ply tongue_001500.ply tongue_002500.ply": HERE,
     ".venv/bin/tonguetrack convert recordings/demo.csv demo.npz": HERE,
     ".venv/bin/tonguetrack model build PATH/sampleDatabase.yaml -o ultrax.npz": WITH_REFERENCE,
     ".venv/bin/tonguetrack model info bundled": HERE,
@@ -146,6 +153,7 @@ def test_the_flags_that_pages_name_exist():
     for command in (
         "demo",
         "track",
+        "anatomy",
         "experiment",
         "mesh",
         "info",
