@@ -431,13 +431,18 @@ def _nearest_scale(box: _Box, weights: _Weights) -> _Weights:
     x = weights.flat
     speaker, pose = x[:m] / spread[:m], x[m:] / spread[m:]
     # Where the derivative of |(c s - mean)/spread|^2 + |(p/c - mean)/spread|^2, times c^3, is 0.
-    quartic = [
-        speaker @ speaker,
-        -speaker @ (mean / spread)[:m],
-        0.0,
-        pose @ (mean / spread)[m:],
-        -pose @ pose,
-    ]
+    quartic = np.array(
+        [
+            float(term)
+            for term in (
+                speaker @ speaker,
+                -speaker @ (mean / spread)[:m],
+                0.0,
+                pose @ (mean / spread)[m:],
+                -pose @ pose,
+            )
+        ]
+    )
     turning = [
         root.real for root in np.roots(quartic) if abs(root.imag) < 1e-9 * abs(root) and root.real > 0.0
     ]
@@ -483,7 +488,7 @@ def _fit(
     return Fit(
         found.speaker,
         found.poses,
-        covariance,
+        np.asarray(covariance, dtype=np.float64),
         np.sqrt(np.diag(covariance)) / model.speaker.sigma,
         residual_mm,
         used,

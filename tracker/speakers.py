@@ -286,7 +286,7 @@ def first_speech(coils: FloatArray, rate_hz: float, seconds: float) -> slice:
 
 def differences(model: TongueModel, results: Mapping[str, SpeakerResult]) -> tuple[Difference, ...]:
     """Where two ways contradict each other, as far as their uncertainties go."""
-    found = []
+    found: list[Difference] = []
     for one, other in combinations(results, 2):
         apart = (results[one].weights - results[other].weights) / model.speaker.sigma
         error = np.hypot(results[one].sigma, results[other].sigma)
