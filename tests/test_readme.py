@@ -101,6 +101,10 @@ DOCS = {
     ".venv/bin/tonguetrack anatomy recordings/demo.csv --session session.toml"
     " --mesh tongue_000500.ply tongue_001500.ply tongue_002500.ply": HERE,
     ".venv/bin/tonguetrack convert recordings/demo.csv demo.npz": HERE,
+    ".venv/bin/tonguetrack simulate recording visit.csv --seconds 4 --head-motion --dropouts 0.05 "
+    "--coils tongue_tip,tongue_blade,tongue_dorsum,head_nose,head_left,head_right,head_upper_incisor": HERE,
+    ".venv/bin/tonguetrack calibrate visit.csv --rest 0:1 --smoothing carstens -o speaker.toml --report calibration": HERE,
+    ".venv/bin/tonguetrack track visit.csv --session speaker.toml --out visit.poses.csv": HERE,
     ".venv/bin/tonguetrack model build PATH/sampleDatabase.yaml -o ultrax.npz": WITH_REFERENCE,
     ".venv/bin/tonguetrack model info bundled": HERE,
     ".venv/bin/tonguetrack model convert ultrax.npz ultrax.yaml": WITH_REFERENCE,

@@ -181,9 +181,9 @@ def calibrate(
     role, of all files (None: by the names); frame: the axes of all files, where they do not state them or state them
     wrongly. Deterministic. Raises InputError where the files contradict each other, or leave open what is needed.
     """
-    told: list[str] = []
     first = recordings[0]
     _check_alike(recordings)
+    told = list(dict.fromkeys(note for one in recordings for note in one.notes))
     coil_map, others = _coil_map(first, coils, told)
     axes = _axes(first, frame, told)
     told.append(f"smoothing: {_smoothing_words(smoothing)}")
@@ -316,7 +316,8 @@ def _axes(recording: Recording, frame: FrameOfReference | None, told: list[str])
 def _smoothing_words(smoothing: Smoothing) -> str:
     if smoothing == NO_SMOOTHING:
         return "none (--smoothing names a preset; the raw data are kept anyway)"
-    return smoothing.preset
+    filters = ", ".join(f"{role} {chosen}" for role, chosen in smoothing.recorded.items())
+    return f"{smoothing.preset} ({filters})"
 
 
 def _still(

@@ -198,7 +198,7 @@ def draw_correspondences(calibration: Calibration, model: TongueModel) -> Figure
         )
         panel.plot(*middle[1:], "x", color=colour, markersize=8, markeredgewidth=2)
         panel.annotate(
-            str(index + 1), shape[vertex, 1:], xytext=(7, 7), textcoords="offset points", weight="bold"
+            str(index + 1), tuple(shape[vertex, 1:]), xytext=(7, 7), textcoords="offset points", weight="bold"
         )
     _side_view(panel)
     panel.set_title("correspondences on this speaker's mesh, mean pose")
