@@ -93,6 +93,13 @@ DOCS = {
     ".venv/bin/tonguetrack track recordings/demo.csv --out poses.csv --save-session session.toml": HERE,
     ".venv/bin/tonguetrack mesh poses.csv --frame 100 -o tongue.ply": HERE,
     ".venv/bin/tonguetrack mesh poses.csv --every 50 -o tongue.ply": HERE,
+    ".venv/bin/tonguetrack evaluate-tracking SAMPLES.yaml --coils 2465,1912,1250 -o report/": (
+        ELSEWHERE + "test_evaluation.py, on synthetic and on real meshes"
+    ),
+    (
+        ".venv/bin/tonguetrack evaluate-tracking speakers/samples.yaml --coils 906,1347,1935 "
+        "--regions tip,blade,back,combined"
+    ): HERE,
     ".venv/bin/tonguetrack experiment recordings/demo.csv -o report/": HERE,
     ".venv/bin/tonguetrack experiment recordings/demo.csv --features 200 --anatomy joint -o report/": HERE,
     ".venv/bin/tonguetrack anatomy recordings/demo.csv --session session.toml": HERE,
@@ -170,6 +177,8 @@ def test_the_flags_that_pages_name_exist():
         "live",
         "take info",
         "take export",
+        "calibrate",
+        "evaluate-tracking",
     ):
         done = subprocess.run(
             [tool(), *command.split(), "--help"], capture_output=True, text=True, check=True
