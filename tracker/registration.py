@@ -59,14 +59,15 @@ MODEL_NOISE_MM = 1.0  # what parts a real speaker and the model at the coils; th
 DEVICE_NOISE_MM = 0.3  # of a coordinate; what is less does not repeat from frame to frame
 NOISES_MM = np.geomspace(0.1, MODEL_NOISE_MM, 25)
 OUTLIER_MEDIANS = 6.0
-PALATE_SD_MM = 0.5
+PALATE_SD_MM = 0.25
 WORST_SHARE = 0.05  # of the frames, for the palate's bound
 PALATE_STRIDE = 3  # of the shown frames, while the motion is sought
 ROUGH_ROUNDS, ROUNDS = 2, 15
 FINISHED_ENDS = 2
+LATERAL_TRIALS = 12  # vertices around a lateral coil
 ADAPTATIONS = 4  # between two slides along the contour
 COOLING = 0.6  # by which the noise may fall between two slides: with less noise, places are harder to leave
-TRIAL_STEPS = 12  # of a descent that only compares places
+FULL_STEPS, TRIAL_STEPS = 60, 12  # of a descent; of one that only compares places
 UNITS = (2.0, 0.05)  # mm and radians of one step of the search
 DIFFERENCE = 1e-5
 FAR_FROM_GUESS = 2.5  # standard deviations
@@ -376,8 +377,9 @@ class _Posterior:
         steps = np.linalg.norm(np.diff(self._mean[: len(contour), 1:], axis=0), axis=1)
         self._along = np.concatenate([[0.0], np.cumsum(steps)])
         self._speaker_sd, pose_sd = (_measured_sigma(mode) for mode in (model.speaker, model.pose))
-        self._pose_mean = model.pose.mean.copy()  # read-only arrays are another type for the compiler
-        self._pose_covariance = np.diag(pose_sd**2)
+        # Copies: read-only arrays are another type for the compiler.
+        self._training_poses = model.pose.mean.copy(), np.diag(pose_sd**2)
+        self._pose_mean, self._pose_covariance = self._training_poses
         self.size = 3 if midsagittal else 6
         self._shifts = 2 if midsagittal else 3  # the rest of the motion turns
         turns = self.size - self._shifts
@@ -481,8 +483,9 @@ class _Posterior:
         self.noise_mm = own
         return value
 
-    def _value_and_slope(self, unknowns: FloatArray, places: Places) -> tuple[float, FloatArray]:
-        """J, and its derivatives in the speaker (in measured sigma), without the palate's."""
+    def _value_and_slope(self, unknowns: FloatArray, places: Places) -> tuple[float, FloatArray, bool]:
+        """J, its derivatives in the speaker (in measured sigma) without the palate's, whether the palate has a say."""
+        bound = False
         frame = self._frame_terms(unknowns, places, self.noise_mm)
         speaker = unknowns[self.size :]
         value = self._independent_frames * frame.value + 0.5 * float(speaker @ speaker)
@@ -495,8 +498,9 @@ class _Posterior:
         if self._palate is not None:
             heights = np.sort(self._heights(unknowns, frame))
             worst = heights[-max(1, round(WORST_SHARE * len(heights))) :]
+            bound = bool(worst[-1] > 0.0)
             value += 0.5 * (float(np.maximum(worst, 0.0).mean()) / PALATE_SD_MM) ** 2
-        return value, self._independent_frames * frame.slope * self._speaker_sd + speaker
+        return value, self._independent_frames * frame.slope * self._speaker_sd + speaker, bound
 
     def _frame_terms(self, unknowns: FloatArray, places: Places, noise_mm: float) -> FrameTerms:
         """The mean over the frames of their negative log likelihood, up to a constant."""
@@ -548,7 +552,7 @@ class _Posterior:
         return _Found(unknowns, places, value)
 
     def _descend(
-        self, unknowns: FloatArray, places: Places, steps: int = 60, scaling: FloatArray | None = None
+        self, unknowns: FloatArray, places: Places, steps: int = FULL_STEPS, scaling: FloatArray | None = None
     ) -> tuple[FloatArray, float]:
         """BFGS; the speaker's derivatives are exact unless the palate has a say, the motion's by differences.
 
@@ -557,13 +561,12 @@ class _Posterior:
         from scipy.optimize import minimize
 
         scaling = np.diag(self._units) if scaling is None else scaling
-        by_differences = self.size if self._palate is None else len(unknowns)
 
         def value_and_slope(scaled: FloatArray) -> tuple[float, FloatArray]:
             here = unknowns + scaling @ scaled
-            value, speaker_slope = self._value_and_slope(here, places)
+            value, speaker_slope, bound = self._value_and_slope(here, places)
             slope = np.concatenate([np.zeros(self.size), speaker_slope])
-            for index in range(by_differences):
+            for index in range(len(here) if bound else self.size):
                 there = here.copy()
                 step = DIFFERENCE * self._units[index]
                 there[index] += step
@@ -581,57 +584,75 @@ class _Posterior:
 
     def _slid(self, unknowns: FloatArray, places: Places) -> Places:
         """The places after sliding coils along the contour; motion and speaker follow each trial."""
-        cost = self._cost_of_places(unknowns, places)
+        cost = self._cost_of_places(unknowns, places, TRIAL_STEPS)
         places = slid_along_contour(places, self._middle, self._contour_size, cost)
         for stride in (4, 2, 1, 1):
             together = (self._all_slid(places, move) for move in (-stride, stride))
             places = min((places, *(one for one in together if one is not None)), key=cost)
         for index in self._lateral:
-            trial = list(places)
-            trial[index] = self._nearest_on_surface(unknowns, places, index)
-            if cost(tuple(trial)) < cost(places):
-                places = tuple(trial)
+            trials = [places]
+            for place in self._nearest_on_surface(unknowns, places, index):
+                trials.append((*places[:index], place, *places[index + 1 :]))
+            places = min(trials, key=cost)
         return places
 
     def _slid_by_one(self, unknowns: FloatArray, places: Places) -> Places:
-        """The best of the places where each mid-sagittal coil has slid by one vertex or not, in every combination."""
-        cost = self._cost_of_places(unknowns, places)
-        trials = [places]
-        for moves in product((-1, 0, 1), repeat=len(self._middle)):
-            trial = np.array(places)
-            trial[self._middle] += moves
-            slid = trial[self._middle]
-            if slid.min() >= 0 and slid.max() < self._contour_size and (np.diff(slid) > 0).all():
-                trials.append(tuple(int(place) for place in trial))
-        best = min(trials, key=cost)
-        return best if cost(best) < cost(places) - 1e-6 else places
+        """The best of the places where each mid-sagittal coil has slid by one vertex or not, in every combination.
 
-    def _cost_of_places(self, unknowns: FloatArray, places: Places) -> Callable[[Places], float]:
+        Compared with the poses of the training: the recording's own have adapted to the places where they are.
+        """
+        own = self._pose_mean, self._pose_covariance
+        self._pose_mean, self._pose_covariance = self._training_poses
+        unknowns, _ = self._descend(unknowns, places)
+        cost = self._cost_of_places(unknowns, places, FULL_STEPS)
+        best = places
+        for moves in product((-1, 0, 1), repeat=len(self._middle)):
+            trial = self._moved_places(places, moves)
+            if trial is not None:
+                best = min(best, trial, key=cost)
+        if best == places:
+            self._pose_mean, self._pose_covariance = own
+        return best
+
+    def _cost_of_places(self, unknowns: FloatArray, places: Places, steps: int) -> Callable[[Places], float]:
         """J of other places nearby, to which motion and speaker follow; remembered."""
         known: dict[Places, float] = {}
         scaling = np.linalg.cholesky(self._covariance(unknowns, places))
 
         def cost(trial: Places) -> float:
             if trial not in known:
-                known[trial] = self._descend(unknowns, trial, TRIAL_STEPS, scaling)[1]
+                known[trial] = self._descend(unknowns, trial, steps, scaling)[1]
             return known[trial]
 
         return cost
 
     def _all_slid(self, places: Places, move: int) -> Places | None:
         """All mid-sagittal coils together, as a wrong motion along the tongue has them; None beyond the contour."""
-        trial = list(places)
-        for index in self._middle:
-            trial[index] += move
-        inside = all(0 <= trial[index] < self._contour_size for index in self._middle)
-        return tuple(trial) if inside else None
+        return self._moved_places(places, [move] * len(self._middle))
 
-    def _nearest_on_surface(self, unknowns: FloatArray, places: Places, index: int) -> int:
-        """The place on the upper surface that is nearest to a lateral coil on average over the frames."""
+    def _moved_places(self, places: Places, moves: Sequence[int]) -> Places | None:
+        """Each mid-sagittal coil slid by its move, the lateral ones taken along; None where that is no order."""
+        trial = np.array(places)
+        trial[self._middle] += moves
+        slid = trial[self._middle]
+        if slid.size == 0 or slid.min() < 0 or slid.max() >= self._contour_size or (np.diff(slid) <= 0).any():
+            return None
+        before = [places[index] for index in self._middle]
+        shift = (self._mean[slid] - self._mean[before]).mean(axis=0)
+        for index in self._lateral:
+            away = np.linalg.norm(
+                self._mean[self._contour_size :] - self._mean[places[index]] - shift, axis=1
+            )
+            trial[index] = self._contour_size + int(np.argmin(away))
+        return tuple(int(place) for place in trial)
+
+    def _nearest_on_surface(self, unknowns: FloatArray, places: Places, index: int) -> list[int]:
+        """The places on the upper surface that are nearest to a lateral coil on average over the frames."""
         frame = self._frame_terms(unknowns, places, self.noise_mm)
         shapes = _shapes(self._surface, self.speaker(unknowns), self._poses(unknowns, frame))
         apart = np.linalg.norm(shapes - self.moved(unknowns)[:, index][:, None], axis=2)
-        return self._contour_size + int(np.argmin(apart.mean(axis=0)))
+        nearest = np.argsort(apart.mean(axis=0), kind="stable")[:LATERAL_TRIALS]
+        return [self._contour_size + int(place) for place in nearest]
 
     def _adapt(self, unknowns: FloatArray, places: Places, least_noise_mm: float) -> None:
         """The frames that are no outliers, their poses, and the noise that makes them most probable."""
