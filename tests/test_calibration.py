@@ -322,6 +322,11 @@ def test_words_that_are_no_interval(refused):
     assert "START:END" in refused("--rest", "soon")
 
 
+def test_a_smoothing_that_does_not_exist(refused):
+    said = refused("--smoothing", "loud")
+    assert "--smoothing loud" in said and "none, carstens" in said
+
+
 def test_a_palate_sweep_without_the_reference_coils(files, small_model, tmp_path):
     place, _ = files
     sweep = open_recording(place / "palate.npz")

@@ -47,7 +47,10 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help='where the axes grow, as in "front left up", where files do not state it',
     )
     calibrate.add_argument(
-        "--smoothing", metavar="PRESET", help="carstens, tardis, haskins, ema2wav or mocha (default: none)"
+        "--smoothing",
+        metavar="PRESET",
+        default="none",
+        help="carstens, tardis, haskins, ema2wav, mocha, or none (default)",
     )
     calibrate.add_argument(
         "-o", "--output", required=True, metavar="FILE", help="the session file (TOML) to be written"
@@ -116,11 +119,17 @@ def parsed_interval(text: str) -> tuple[float, float]:
     return float(match[1]), float(match[2])
 
 
-def named_smoothing(name: str | None) -> Smoothing:
-    """A preset by its name; none where none is named."""
-    from ..smoothing import NO_SMOOTHING, smoothing_from_toml
+def named_smoothing(name: str) -> Smoothing:
+    """A preset by its name, or none."""
+    from ..smoothing import NO_SMOOTHING, PRESETS, smoothing_from_toml
 
-    return smoothing_from_toml({"preset": name}) if name else NO_SMOOTHING
+    if name == "none":
+        return NO_SMOOTHING
+    if name not in PRESETS:
+        raise InputError(
+            f"--smoothing {name}: there is no such preset; choose from none, {', '.join(PRESETS)}."
+        )
+    return smoothing_from_toml({"preset": name})
 
 
 def _opened(name: str, args: argparse.Namespace) -> Recording:
