@@ -62,6 +62,7 @@ def errors(found, displaced_coils, coils, rotation):
     ("seed", "motion"), [(0, (2.5, -1.5, 3.0)), (1, (-3.0, 2.0, -4.0)), (3, (0.0, 3.0, 2.0))]
 )
 def test_a_motion_within_a_bite_planes_uncertainty_is_undone(model, seed, motion):
+    """For speakers of the model itself. Not for every one: of the seeds 0 to 9, number 4 ends 0.38 mm away."""
     coils, vertices = coils_of(model, seed)
     moved, rotation, _ = displaced(coils, *motion)
     found = fit_alignment(model, moved, ROLES, NEAR, Energy())
