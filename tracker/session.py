@@ -180,7 +180,9 @@ def session_toml(session: Session) -> str:
     if session.smoothing != NO_SMOOTHING:
         _add_table(document, "smoothing", "before anything else", smoothing_toml(session.smoothing))
     if session.head is not None:
-        _add_table(document, "head", "the reference coils at rest, in the device's axes", head_toml(session.head))
+        _add_table(
+            document, "head", "the reference coils at rest, in the device's axes", head_toml(session.head)
+        )
     alignment = session.alignment
     stated: dict[str, Any] = {
         "rotation": alignment.rotation.tolist(),
@@ -212,7 +214,17 @@ def _add_table(document: Any, name: str, comment: str, content: Mapping[str, Any
 
 
 def _session_from(content: Mapping[str, Any], source: str) -> Session:
-    known = {"model", "coils", "smoothing", "head", "alignment", "palate", "correspondences", "speaker", "energy"}
+    known = {
+        "model",
+        "coils",
+        "smoothing",
+        "head",
+        "alignment",
+        "palate",
+        "correspondences",
+        "speaker",
+        "energy",
+    }
     for table in content:
         if table not in known:
             raise InputError(f"the table or key '{table}' is unknown; expected {', '.join(sorted(known))}.")
