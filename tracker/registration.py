@@ -313,7 +313,7 @@ def mean_frame(
     answering = pose_covariance @ directions
     expected_middle = origin + pose_mean @ directions
     off = middle - expected_middle
-    inverse = np.linalg.inv(directions.T @ answering + noise_mm**2 * np.eye(size))
+    inverse: FloatArray = np.linalg.inv(directions.T @ answering + noise_mm**2 * np.eye(size))
     pull = inverse @ off
     value = 0.5 * (np.sum(inverse * spread) + np.sum(off * pull) - np.linalg.slogdet(inverse)[1])
     narrower = inverse - inverse @ spread @ inverse - np.outer(pull, pull)
@@ -617,7 +617,7 @@ class _Posterior:
     def _cost_of_places(self, unknowns: FloatArray, places: Places, steps: int) -> Callable[[Places], float]:
         """J of other places nearby, to which motion and speaker follow; remembered."""
         known: dict[Places, float] = {}
-        scaling = np.linalg.cholesky(self._covariance(unknowns, places))
+        scaling = np.asarray(np.linalg.cholesky(self._covariance(unknowns, places)), dtype=np.float64)
 
         def cost(trial: Places) -> float:
             if trial not in known:
