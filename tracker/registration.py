@@ -313,7 +313,7 @@ def mean_frame(
     answering = pose_covariance @ directions
     expected_middle = origin + pose_mean @ directions
     off = middle - expected_middle
-    inverse: FloatArray = np.linalg.inv(directions.T @ answering + noise_mm**2 * np.eye(size))
+    inverse = np.linalg.inv(directions.T @ answering + noise_mm**2 * np.eye(size))
     pull = inverse @ off
     value = 0.5 * (np.sum(inverse * spread) + np.sum(off * pull) - np.linalg.slogdet(inverse)[1])
     narrower = inverse - inverse @ spread @ inverse - np.outer(pull, pull)
@@ -322,7 +322,7 @@ def mean_frame(
     for weight in range(speakers):
         slope[weight] = np.sum(core[weight] * by_direction)
     # The most probable pose = mean + gain @ (coils - expected).
-    return FrameTerms(value, slope, -expected_middle, answering @ inverse, inverse, directions)
+    return FrameTerms(value, slope, -expected_middle, answering @ inverse, inverse, directions)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
