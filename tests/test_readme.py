@@ -267,9 +267,10 @@ def run_here(page: Path, table: dict[str, str], folder: Path) -> None:
 
 
 def run_page(page: Path, folder: Path) -> None:
-    """A page of docs, beginning without the takes of the page before: none is ever overwritten."""
+    """A page of docs, beginning without the takes and meshes of the page before: none is ever overwritten."""
     for take in folder.glob("*.xdf"):
         take.unlink()
+    shutil.rmtree(folder / "speakers", ignore_errors=True)
     run_here(page, DOCS, folder)
 
 
