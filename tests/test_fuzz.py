@@ -38,6 +38,7 @@ from tonguetrack.drivers.devices.carstens_source import CarstensConversation, sh
 from tonguetrack.drivers.devices.link import LinkLost
 from tonguetrack.drivers.devices.ndi_source import Coil, Device, NdiConversation
 from tonguetrack.drivers.devices.ndi_tracking import Markers, State, ToolState, TrackingReply
+from tonguetrack.drivers.devices.rtc3d_decode import decode_into
 from tonguetrack.drivers.devices.rtc3d_source import Rtc3dConversation
 from tonguetrack.drivers.files.common import Options
 from tonguetrack.drivers.files.recognise import parse as parse_recording
@@ -223,7 +224,7 @@ def rtc3d_frame(example, folder):
     seen = rtc3d.order_of(example.data, order)
     for kind in (rtc3d.SIX_D, rtc3d.THREE_D):
         arrays = (np.empty((5, 3)), np.empty((5, 4)), np.empty(5))[: 3 if kind == rtc3d.SIX_D else 1]
-        if rtc3d.decode_into(example.data, order, kind, *arrays) is not None:
+        if decode_into(example.data, order, kind, *arrays) is not None:
             all_finite_or_none(arrays[0])
             assert seen is not None
     for component in rtc3d.decode_frame(example.data, order):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from tonguetrack.drivers.devices import rtc3d
 from tonguetrack.drivers.devices.rtc3d import BIG, LITTLE, Component, PacketReader, Rtc3dError
+from tonguetrack.drivers.devices.rtc3d_decode import decode_into
 
 ORDERS = (BIG, LITTLE)
 # The head of a data frame of a real Wave: 1 component, 536 bytes, 6D, frame 25865, 16 tools.
@@ -106,7 +107,7 @@ def test_the_head_of_a_real_wave_frame_is_understood():
     body = wave_body([*tools, MISSING_TOOL, *[tool(0.6, 0.8, 0, 0, 4, 5, 6, 0.25)] * 11])
     assert len(body) + 8 == 548
     positions, quaternions, rms = frame_arrays(16)
-    head = rtc3d.decode_into(body, BIG, rtc3d.SIX_D, positions, quaternions, rms)
+    head = decode_into(body, BIG, rtc3d.SIX_D, positions, quaternions, rms)
     assert (head.number, head.time_us, head.count) == (25865, 64_662_500, 16)
     assert head.time_us == head.number * 2500
     np.testing.assert_allclose(positions[3], [1, 2, 3])
@@ -141,7 +142,7 @@ def test_missing_coils_are_ff_bytes_or_zeros_and_read_as_nan_either_way(order):
         body = six_d(positions, order=order, zeros=zeros)
         assert body[28 + 32 : 28 + 64] == bytes_of_one
         read, quaternions, rms = frame_arrays(3)
-        rtc3d.decode_into(body, order, rtc3d.SIX_D, read, quaternions, rms)
+        decode_into(body, order, rtc3d.SIX_D, read, quaternions, rms)
         np.testing.assert_array_equal(read, positions)  # a coil at the origin that is turned is there
         assert np.isnan(quaternions[1]).all() and np.isnan(rms[1])
         assert np.isfinite(quaternions[[0, 2]]).all()
@@ -155,7 +156,7 @@ def test_a_tool_with_an_impossible_number_is_missing_as_a_whole(value, place):
     good = tool(0.6, 0.8, 0, 0, 4, 5, 6, 0)
     body = struct.pack(">IIIIQI", 1, 24 + 64, 4, 1, 2500, 2) + tool(*values) + good
     positions, quaternions, rms = frame_arrays(2)
-    rtc3d.decode_into(body, BIG, rtc3d.SIX_D, positions, quaternions, rms)
+    decode_into(body, BIG, rtc3d.SIX_D, positions, quaternions, rms)
     assert np.isnan(positions[0]).all() and np.isnan(quaternions[0]).all() and np.isnan(rms[0])
     np.testing.assert_array_equal(positions[1], [4, 5, 6])
 
@@ -163,7 +164,7 @@ def test_a_tool_with_an_impossible_number_is_missing_as_a_whole(value, place):
 def test_a_fit_error_that_is_no_number_leaves_the_position_alone():
     body = struct.pack(">IIIIQI", 1, 24 + 32, 4, 1, 2500, 1) + tool(0.6, 0.8, 0, 0, 1, 2, 3, np.inf)
     positions, quaternions, rms = frame_arrays(1)
-    rtc3d.decode_into(body, BIG, rtc3d.SIX_D, positions, quaternions, rms)
+    decode_into(body, BIG, rtc3d.SIX_D, positions, quaternions, rms)
     assert np.isnan(rms[0])
     np.testing.assert_array_equal(positions[0], [1, 2, 3])
 
@@ -175,18 +176,18 @@ def test_markers_have_positions_only_and_are_missing_by_nan_zeros_or_reliability
     items = np.vstack([made, [[7, 8, 9, 999.0], [0, 0, 0, 0], [1, 1, 1, np.nan], [2, 2, 2, 0.5]]])
     body = rtc3d.encode_frame([Component(rtc3d.THREE_D, 1, 1, items.astype(np.float32))], order)
     positions = np.empty((7, 3))
-    assert rtc3d.decode_into(body, order, rtc3d.SIX_D, positions) is None
-    rtc3d.decode_into(body, order, rtc3d.THREE_D, positions)
+    assert decode_into(body, order, rtc3d.SIX_D, positions) is None
+    decode_into(body, order, rtc3d.THREE_D, positions)
     np.testing.assert_array_equal(np.isnan(positions).any(axis=1), [0, 1, 0, 1, 1, 1, 0])
     np.testing.assert_array_equal(positions[[0, 2, 6]], [[1, 2, 3], [4, 5, 6], [2, 2, 2]])
 
 
 def test_fewer_items_than_coils_are_missing_coils_and_more_are_left_out():
     positions, quaternions, rms = frame_arrays(3)
-    head = rtc3d.decode_into(six_d([[1, 2, 3]]), BIG, rtc3d.SIX_D, positions, quaternions, rms)
+    head = decode_into(six_d([[1, 2, 3]]), BIG, rtc3d.SIX_D, positions, quaternions, rms)
     assert head.count == 1
     assert np.isnan(positions[1:]).all() and np.isnan(quaternions[1:]).all() and np.isnan(rms[1:]).all()
-    head = rtc3d.decode_into(six_d([[k, k, k] for k in range(5)]), BIG, rtc3d.SIX_D, positions)
+    head = decode_into(six_d([[k, k, k] for k in range(5)]), BIG, rtc3d.SIX_D, positions)
     assert head.count == 5
     np.testing.assert_array_equal(positions, [[0, 0, 0], [1, 1, 1], [2, 2, 2]])
 
@@ -198,7 +199,7 @@ def test_components_of_unknown_kinds_are_stepped_over_by_their_size(order):
         unknown = struct.pack(order + "IIIQ", 20 + len(rest), 77, 1, 2) + rest
         body = struct.pack(order + "I", 2) + unknown + known
         positions = np.empty((1, 3))
-        assert rtc3d.decode_into(body, order, rtc3d.SIX_D, positions).number == 7
+        assert decode_into(body, order, rtc3d.SIX_D, positions).number == 7
         assert [c.kind for c in rtc3d.decode_frame(body, order)] == [rtc3d.SIX_D]
 
 
@@ -231,7 +232,7 @@ def test_a_frame_without_components_has_no_byte_order():
 )
 def test_sizes_and_counts_that_do_not_fit_are_an_error(body, words):
     with pytest.raises(Rtc3dError, match=words):
-        rtc3d.decode_into(body, BIG, rtc3d.SIX_D, np.empty((1, 3)))
+        decode_into(body, BIG, rtc3d.SIX_D, np.empty((1, 3)))
     with pytest.raises(Rtc3dError, match=words):
         rtc3d.decode_frame(body, BIG)
 
@@ -249,7 +250,7 @@ def test_damaged_frames_raise_nothing_but_the_error_and_leave_no_nonsense(damage
     body = bytes(body[: max(end, 30)])
     positions, quaternions, rms = frame_arrays(3)
     try:
-        head = rtc3d.decode_into(body, order, rtc3d.SIX_D, positions, quaternions, rms)
+        head = decode_into(body, order, rtc3d.SIX_D, positions, quaternions, rms)
         rtc3d.decode_frame(body, order)
     except Rtc3dError:
         return

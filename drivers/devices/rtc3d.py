@@ -212,61 +212,6 @@ def decode_frame(body: bytes, order: str) -> tuple[Component, ...]:
     return tuple(out)
 
 
-def decode_into(
-    body: bytes,
-    order: str,
-    kind: int,
-    positions: FloatArray,
-    quaternions: FloatArray | None = None,
-    rms: FloatArray | None = None,
-) -> ComponentHead | None:
-    """Reads the first component of `kind` (SIX_D or THREE_D) into arrays that are used again and again.
-
-    positions (coils, 3) mm, quaternions (coils, 4) as (w, x, y, z), rms (coils,) in the device's unit; NaN =
-    missing. Items beyond `coils` are left out, coils beyond the items are missing. quaternions and rms are
-    for SIX_D alone. None, and nothing written, where the frame has no such component. Raises Rtc3dError.
-
-    Missing are: whatever is not finite or beyond FARTHEST (a missing item is all FF bytes, which are NaN),
-    zeros throughout (as an emulator in use sends), and 3D items of reliability 999.
-    """
-    found = None
-    for head in component_heads(body, order):
-        if head.kind == kind and found is None:
-            found = head
-    if found is None:
-        return None
-    coils = min(found.count, len(positions))
-    items = _floats(body, order, found)[:coils]
-    # A missing item's bytes are NaN in every field, so that copying says so; what is left to find are rows of
-    # zeros and impossible numbers. Few calls: at 1250 Hz each of them counts.
-    with np.errstate(invalid="ignore"):  # damaged bytes may be signalling NaNs
-        if kind == SIX_D:
-            positions[:coils] = items[:, 4:7]
-            largest = np.abs(items[:, :7]).max(axis=1)
-        else:
-            positions[:coils] = items[:, :3]
-            largest = np.abs(items).max(axis=1)
-        if quaternions is not None:
-            quaternions[:coils] = items[:, :4]
-        if rms is not None:
-            rms[:coils] = items[:, 7]
-        good = (largest > 0.0) & (largest <= FARTHEST)
-    if kind == THREE_D:
-        good &= items[:, 3] != UNRELIABLE
-    if rms is not None and not np.isfinite(rms[:coils][good]).all():
-        rms[:coils][~np.isfinite(rms[:coils])] = np.nan
-    if coils < len(positions):
-        good = np.concatenate([good, np.zeros(len(positions) - coils, np.bool_)])
-    if not good.all():
-        lost = ~good
-        positions[lost] = np.nan
-        if quaternions is not None:
-            quaternions[lost] = np.nan
-        if rms is not None:
-            rms[lost] = np.nan
-    return found
-
-
 def six_d_items(
     positions: FloatArray, quaternions: FloatArray, rms: FloatArray | None = None, zeros: bool = False
 ) -> NDArray[np.float32]:

@@ -16,6 +16,7 @@ from ..frames import CoilFrame, FrameOfReference, NoteKind, SourceNote
 from ..sources import SourceAddress
 from . import rtc3d
 from .link import Link, LinkLost, connect_tcp
+from .rtc3d_decode import decode_into
 from .source import DeviceSource
 
 REPLY_S = 1.0  # for one answer in the handshake; who is silent for longer is taken as he is
@@ -215,9 +216,7 @@ class Rtc3dConversation:
 
     def _coil_frame(self, body: bytes) -> CoilFrame | None:
         try:
-            head = rtc3d.decode_into(
-                body, self._order, self._kind, self._positions, self._quaternions, self._rms
-            )
+            head = decode_into(body, self._order, self._kind, self._positions, self._quaternions, self._rms)
         except rtc3d.Rtc3dError as reason:
             self._note(NoteKind.BAD_DATA, f"a damaged frame was left out: {reason}", 1)
             return None
