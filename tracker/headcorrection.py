@@ -2,7 +2,7 @@
 
 A frame's motion is the rigid one that takes the references at rest nearest to where they are now: weighted least
 squares by a unit quaternion (B. K. P. Horn, "Closed-form solution of absolute orientation using unit quaternions",
-1987), whose 4 x 4 eigenvalue problem is solved by Jacobi rotations. All positions are in the source's own frame, mm.
+1987), the largest eigenvector of a 4 x 4 matrix, which is found by squaring it again and again. All positions are in the source's own frame, mm.
 
 Which references can be believed is told by their mutual distances, which no motion of the head changes. A distance
 that differs from the one at rest by more than `TOLERANCE_MM`, or by more than `NOISE_FACTOR` times the noise of the
@@ -59,7 +59,7 @@ FASTEST_MM_S = 500.0
 USUAL_RATE_HZ = 250.0
 LEAST_WEIGHT = 1e-3
 REST_PASSES = 3
-JACOBI_SWEEPS = 12  # a 4 x 4 matrix needs 4 to 6
+MOST_SQUARINGS = 40  # references that are just not on a line need 13
 
 
 class ReferenceState(IntEnum):
@@ -758,49 +758,45 @@ def _fit(
 
 @njit(**OPTIONS)
 def _largest_eigenvector(work: FloatArray) -> None:
-    """Of the symmetric matrix whose upper triangle is work[:4], by cyclic Jacobi rotations, into work[4]."""
-    matrix = work[:4]
-    vectors = work[8:12]  # in rows
+    """Of the symmetric matrix of trace 0 whose upper triangle is work[:4], into work[4].
+
+    Shifted, so that no eigenvalue is negative, and brought to trace 1, the matrix is squared until the largest
+    eigenvalue has outgrown the others: its columns then are multiples of the eigenvector. The error is that of the
+    first squarings, about the rounding over the gap to the next eigenvalue, as with any other method.
+    """
+    matrix, square = work[:4], work[8:12]
     size = 0.0
     for i in range(4):
-        for j in range(4):
-            vectors[i, j] = 1.0 if i == j else 0.0
-            if j < i:
-                matrix[i, j] = matrix[j, i]
+        for j in range(i):
+            matrix[i, j] = matrix[j, i]
+            size += 2.0 * matrix[i, j] ** 2
         size += matrix[i, i] ** 2
-    for _ in range(JACOBI_SWEEPS):
-        beside = 0.0
+    shift = np.sqrt(0.75 * size)  # of four eigenvalues whose sum is 0 none is larger
+    scale = 0.25 / shift if shift > 0.0 else 0.0
+    for i in range(4):
+        for j in range(4):
+            matrix[i, j] *= scale
+        matrix[i, i] += 0.25
+    for _ in range(MOST_SQUARINGS):
+        trace = 0.0
         for i in range(4):
-            for j in range(i):
-                beside += matrix[i, j] ** 2
-        if beside <= 1e-33 * size:
+            for j in range(i + 1):
+                total = 0.0
+                for inner in range(4):
+                    total += matrix[i, inner] * matrix[j, inner]
+                square[i, j] = total
+            trace += square[i, i]
+        for i in range(4):
+            for j in range(i + 1):
+                matrix[i, j] = square[i, j] / trace
+                matrix[j, i] = matrix[i, j]
+        if trace > 1.0 - 1e-10:  # 1 less twice the share of the others, which this squaring has squared
             break
-        for p in range(3):
-            for q in range(p + 1, 4):
-                if matrix[p, q] == 0.0:
-                    continue
-                half = 0.5 * (matrix[q, q] - matrix[p, p]) / matrix[p, q]
-                tangent = 1.0 / (abs(half) + np.sqrt(half * half + 1.0))
-                if half < 0.0:
-                    tangent = -tangent
-                cosine = 1.0 / np.sqrt(tangent * tangent + 1.0)
-                sine = tangent * cosine
-                for i in range(4):
-                    low, high = matrix[i, p], matrix[i, q]
-                    matrix[i, p] = cosine * low - sine * high
-                    matrix[i, q] = sine * low + cosine * high
-                for i in range(4):
-                    low, high = matrix[p, i], matrix[q, i]
-                    matrix[p, i] = cosine * low - sine * high
-                    matrix[q, i] = sine * low + cosine * high
-                    low, high = vectors[p, i], vectors[q, i]
-                    vectors[p, i] = cosine * low - sine * high
-                    vectors[q, i] = sine * low + cosine * high
     largest = 0
     for i in range(1, 4):
         if matrix[i, i] > matrix[largest, largest]:
             largest = i
-    work[4] = vectors[largest]
+    work[4] = matrix[largest]
 
 
 @njit(**OPTIONS)
