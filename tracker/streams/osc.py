@@ -75,30 +75,41 @@ class FrameBundle:
                 f"at most {MAX_DATAGRAM_BYTES}; use a model with fewer pose modes."
             )
         self.datagram = bytearray(_bundle(messages))
-        # All arguments are 4 bytes and stand at the end of their message.
-        ends = (
-            np.cumsum([_ELEMENT_HEADER_BYTES + len(message) for message in messages]) + _BUNDLE_HEADER_BYTES
-        )
-        self._frame_at = int(ends[0]) - 4 * 3
-        self._quality_at = int(ends[-1]) - 4 * 3
-        self._words = np.frombuffer(self.datagram, dtype=">f4")
-        vector = np.arange(size)
-        pose_words, sigma_words = [int(ends[1]) // 4 - size + vector], [int(ends[2]) // 4 - size + vector]
-        if self.has_scalars:
-            pose_words.append(ends[3 : 3 + size] // 4 - 1)
-            sigma_words.append(ends[3 + size : 3 + 2 * size] // 4 - 1)
-        self._pose_words = np.stack(pose_words)  # (1 or 2, K) places of each coefficient, in 4-byte words
-        self._sigma_words = np.stack(sigma_words)
-        self._write_frame = struct.Struct(">ifi").pack_into
-        self._write_quality = struct.Struct(">fif").pack_into
+        # One format for the whole datagram: what never changes is packed as bytes, between the numbers. After the
+        # pause between two frames that takes a third of the time of writing through arrays.
+        layout, self._parts = ">", []
+        at, self._places = 0, []
+        end = _BUNDLE_HEADER_BYTES
+        for message, tags in zip(messages, self._number_tags(size), strict=True):
+            end += _ELEMENT_HEADER_BYTES + len(message)
+            numbers_at = end - 4 * len(tags)
+            layout += f"{numbers_at - at}s{tags}"
+            self._parts.append(bytes(self.datagram[at:numbers_at]))
+            self._places.append(len(self._parts))
+            self._parts += [0.0] * len(tags)
+            at = end
+        self._pack_into = struct.Struct(layout).pack_into
+        self._scalars = slice(self._places[3], self._places[3] + 4 * size, 2) if self.has_scalars else None
+
+    def _number_tags(self, size: int) -> list[str]:
+        """The numbers at the end of each message, all of 4 bytes."""
+        scalars = ["f"] * (2 * size) if self.has_scalars else []
+        return ["ifi", "f" * size, "f" * size, *scalars, "fif"]
 
     def write(self, pose: TrackedPose, sequence: int, time_s: float, latency_ms: float) -> None:
         """sequence: wraps to 0 after 2^31 - 1; time_s: since the stream's start."""
-        self._write_frame(self.datagram, self._frame_at, sequence & _SEQUENCE_MASK, time_s, pose.status)
-        self._words[self._pose_words] = pose.weights
-        self._words[self._sigma_words] = pose.normalised
+        parts, places = self._parts, self._places
+        weights, normalised = pose.weights.tolist(), pose.normalised.tolist()
+        size = len(weights)
+        frame, vector, sigma, quality = places[0], places[1], places[2], places[-1]
+        parts[frame : frame + 3] = sequence & _SEQUENCE_MASK, time_s, pose.status
+        parts[vector : vector + size] = weights
+        parts[sigma : sigma + size] = normalised
+        if self._scalars is not None:
+            parts[self._scalars] = weights + normalised
         residual = pose.residual_mm if pose.valid_coils else NO_RESIDUAL
-        self._write_quality(self.datagram, self._quality_at, residual, pose.valid_coils, latency_ms)
+        parts[quality : quality + 3] = residual, pose.valid_coils, latency_ms
+        self._pack_into(self.datagram, 0, *parts)
 
 
 def info_datagrams(info: StreamInfo) -> list[bytes]:
