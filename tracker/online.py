@@ -277,6 +277,7 @@ class Tracker:
             residuals_mm=self._solver.residuals_mm,
             speaker_fixed=weights is not None,
             coil_states=self._guard.states,
+            coils=self._preparation.coils,
         )
         self._shown = replace(
             self.pose,
@@ -284,6 +285,7 @@ class Tracker:
             normalised=self.pose.normalised.copy(),
             residuals_mm=np.full(len(setup.vertices), np.nan),
             coil_states=np.full(len(setup.vertices), CoilState.MISSING, np.int64),
+            coils=np.full((len(setup.vertices), 3), np.nan),
         )
         self.changes += 1
 

@@ -6,7 +6,7 @@ the first two, a `TrackedPose` the coefficients of one instant, `TrackedPoses` t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -43,6 +43,7 @@ class TrackedPose:
     speaker_weights: (m,) raw; constant while the speaker is fixed.
     residuals_mm: (n,) distance of each coil from its vertex, NaN = missing.
     coil_states: (n,) `CoilState` of each coil; only trusted ones had a part in the pose.
+    coils: (n, 3) the prepared coil positions, mm in the model frame, NaN = missing; trusted or not.
     speaker_fixed: whether the pose alone was solved.
     residual_mm: mean distance of the trusted coils, NaN without any; energy: E at the minimiser, NaN likewise.
     device_time_s, frame_number: of the source; arrival_ns, solved_ns: `time.perf_counter_ns()` on this host.
@@ -62,6 +63,33 @@ class TrackedPose:
     solved_ns: int = 0
     speaker_fixed: bool = True
     coil_states: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    coils: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def copy(self) -> TrackedPose:
+        """A pose of its own, which nothing writes over."""
+        return replace(
+            self,
+            weights=self.weights.copy(),
+            normalised=self.normalised.copy(),
+            speaker_weights=self.speaker_weights.copy(),
+            residuals_mm=self.residuals_mm.copy(),
+            coil_states=self.coil_states.copy(),
+            coils=self.coils.copy(),
+        )
+
+    def take(self, other: TrackedPose) -> None:
+        """Becomes what the other one is; both have the same shapes. Allocates nothing."""
+        self.weights[:] = other.weights
+        self.normalised[:] = other.normalised
+        self.speaker_weights[:] = other.speaker_weights
+        self.residuals_mm[:] = other.residuals_mm
+        self.coil_states[:] = other.coil_states
+        self.coils[:] = other.coils
+        self.residual_mm, self.energy = other.residual_mm, other.energy
+        self.valid_coils, self.status = other.valid_coils, other.status
+        self.device_time_s, self.frame_number = other.device_time_s, other.frame_number
+        self.arrival_ns, self.solved_ns = other.arrival_ns, other.solved_ns
+        self.speaker_fixed = other.speaker_fixed
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,160 @@
+"""A sink behind a slot: what may wait works in a thread of its own and always gets the newest pose."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol
+
+from ..pose import TrackedPose
+from .sink import StreamInfo
+
+CLOSE_S = 2.0
+"""So long `close` waits for a worker that is at work; one that hangs for longer is left behind."""
+LONGEST_NAP_S = 0.1
+"""A worker without a rate looks at least this often whether it is over."""
+AGAIN_S = 1.0
+"""So long after `begin` failed it is tried again."""
+
+
+class Worker(Protocol):
+    """What stands behind a slot. It may wait, fail and be slow. All but the destination is called in its own thread."""
+
+    @property
+    def destination(self) -> str:
+        """Where it sends to, for people."""
+
+    def begin(self, info: StreamInfo) -> None:
+        """Before the first pose, and again whenever the info is another one."""
+
+    def work(self, pose: TrackedPose) -> None:
+        """Hands on one pose, which stays as it is until `work` returns. OSError = it could not be handed on."""
+
+    def end(self) -> None:
+        """After the last pose."""
+
+
+class SlotSink:
+    """The sink that the loop sees: `send` copies the pose into the slot and never waits.
+
+    rate_hz: poses a second at most; the worker then looks by its own clock and the loop wakes nobody. None = every
+    pose, as long as the worker is fast enough. `dropped` counts the poses that the worker could not hand on and
+    those that a newer one replaced because it did not come in time; poses that are left out for the sake of the
+    rate are no loss. `failure` says why it last failed, "" = it did not, or has recovered.
+    said: called once for each new failure, in the worker's thread.
+    """
+
+    def __init__(
+        self, worker: Worker, rate_hz: float | None = None, said: Callable[[str], None] = lambda text: None
+    ) -> None:
+        self._worker = worker
+        self._said = said
+        self._period_s = None if rate_hz is None else 1.0 / rate_hz
+        self.sent = 0
+        self.dropped = 0
+        self.failure = ""
+        # Three poses: one is being worked on, one waits, one is being written. Each is in one deque or in one
+        # thread's hands; taking from a deque and adding to it are atomic, so that the loop needs no lock.
+        self._free: deque[TrackedPose] = deque()
+        self._newest: deque[TrackedPose] = deque()
+        self._news: deque[StreamInfo] = deque(maxlen=1)
+        self._wake = threading.Event()
+        self._over = False
+        self._due_s = 0.0  # when the worker will look next
+        self._thread: threading.Thread | None = None
+
+    @property
+    def destination(self) -> str:
+        return self._worker.destination
+
+    def start(self, info: StreamInfo) -> None:
+        self._news.append(info)
+        self._over = False
+        self._thread = threading.Thread(target=self._run, name=f"to {self.destination}", daemon=True)
+        self._thread.start()
+
+    def change(self, info: StreamInfo) -> None:
+        self._news.append(info)
+        self._wake.set()
+
+    def send(self, pose: TrackedPose) -> None:
+        """In the loop's thread: a copy and two operations on deques."""
+        try:
+            kept = self._free.popleft()
+            kept.take(pose)
+        except IndexError:  # the first poses of a run
+            kept = pose.copy()
+        try:
+            self._free.append(self._newest.popleft())
+        except IndexError:
+            pass
+        else:
+            if self._period_s is None or time.perf_counter() > self._due_s + self._period_s:
+                self.dropped += 1
+        self._newest.append(kept)
+        if self._period_s is None and not self._wake.is_set():
+            self._wake.set()
+
+    def close(self) -> None:
+        """Lets the worker hand on the last pose, and waits for it, but not for ever."""
+        self._over = True
+        self._wake.set()
+        if self._thread is not None:
+            self._thread.join(CLOSE_S)
+
+    def _run(self) -> None:
+        begun, again_s = False, 0.0
+        self._due_s = time.perf_counter()
+        while True:
+            over = self._over
+            if self._news and time.perf_counter() >= again_s:
+                info = self._news.popleft()
+                begun = self._try(lambda info=info: self._worker.begin(info))
+                if not begun:
+                    again_s = time.perf_counter() + AGAIN_S
+                    if not self._news:
+                        self._news.append(info)
+            if begun:
+                self._work()
+            if over:
+                break
+            self._rest()
+        if begun:
+            self._try(self._worker.end)
+
+    def _work(self) -> None:
+        try:
+            pose = self._newest.popleft()
+        except IndexError:
+            return
+        if self._try(lambda: self._worker.work(pose)):
+            self.sent += 1
+            self.failure = ""
+        else:
+            self.dropped += 1
+        self._free.append(pose)
+
+    def _rest(self) -> None:
+        if self._period_s is None:
+            self._wake.wait(LONGEST_NAP_S)
+            self._wake.clear()
+            return
+        # By the clock and not by naps, so that the rate is the one that was asked for.
+        now_s = time.perf_counter()
+        self._due_s = max(self._due_s + self._period_s, now_s)
+        if self._due_s > now_s:
+            time.sleep(self._due_s - now_s)
+
+    def _try(self, action: Callable[[], None]) -> bool:
+        """Whatever a peer does must not end the thread: its stream goes on when it recovers."""
+        try:
+            action()
+        except Exception as reason:  # noqa: BLE001
+            failure = f"{self.destination}: {reason or type(reason).__name__}"
+            if failure != self.failure:
+                self.failure = failure
+                self._said(failure)
+            return False
+        return True
