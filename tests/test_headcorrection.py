@@ -18,6 +18,7 @@ from tonguetrack.tracker.headcorrection import (
     HeadStatus,
     ReferenceState,
     correct,
+    follow_head,
     head_from_toml,
     head_motion,
     head_toml,
@@ -134,14 +135,15 @@ def test_frame_by_frame_and_over_a_recording_it_is_the_same_to_the_bit():
     now[300:500, 1] += [6.0, 4.0, 3.0]
     motion = head_motion(now, reference())
     corrector = HeadCorrector(reference())
-    rotation, translation = np.empty((3, 3)), np.empty(3)
+    references, *_, live, states = corrector.arrays
     for repeat in range(2):
         for frame in range(len(now)):
-            status = corrector.step(now[frame], rotation, translation)
-            np.testing.assert_array_equal(rotation, motion.rotations[frame])
-            np.testing.assert_array_equal(translation, motion.translations[frame])
-            np.testing.assert_array_equal(corrector.states, motion.states[frame])
-            np.testing.assert_array_equal(corrector.residual_mm, motion.residuals_mm[frame])
+            references[:] = now[frame]
+            status = follow_head(*corrector.arrays)
+            np.testing.assert_array_equal(live[:3], motion.rotations[frame])
+            np.testing.assert_array_equal(live[3], motion.translations[frame])
+            np.testing.assert_array_equal(live[4, 1], motion.residuals_mm[frame])
+            np.testing.assert_array_equal(states, motion.states[frame])
             assert status == motion.statuses[frame]
         corrector.reset()
     assert len(np.unique(motion.statuses)) > 1
@@ -395,10 +397,6 @@ def test_a_6d_reference_that_loses_its_orientation_keeps_the_translation():
     motion = head_motion(now, at_rest, quaternions=turned)
     assert (motion.statuses == [HeadStatus.OK] * 50 + [HeadStatus.ONE_LEFT] * 50).all()
     np.testing.assert_allclose(correct(now, motion), np.broadcast_to(place, now.shape), atol=1e-9)
-    live = HeadCorrector(at_rest)
-    rotation, translation = np.empty((3, 3)), np.empty(3)
-    assert live.step(now[0], rotation, translation, turned[0]) == HeadStatus.OK
-    assert live.step(now[1], rotation, translation) == HeadStatus.ONE_LEFT
 
 
 def test_a_6d_reference_among_three_steps_in_when_the_others_fail():

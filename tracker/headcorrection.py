@@ -147,9 +147,10 @@ class HeadMotion:
 
 
 class HeadCorrector:
-    """The head's motion one frame at a time; compiled, nothing is allocated.
+    """What is known of the head from one frame to the next.
 
-    rate_hz: nominal. states: (k,) `ReferenceState` of the last frame.
+    rate_hz: nominal. states: (k,) `ReferenceState` of the last frame. arrays: what the compiled `follow_head` is given,
+    which does one frame: its first two are the frame's references, (k, 3) mm and (k, 4), NaN = missing.
     """
 
     def __init__(self, reference: HeadReference, rate_hz: float = USUAL_RATE_HZ) -> None:
@@ -164,43 +165,17 @@ class HeadCorrector:
         self._memory = np.zeros((_APART + count, count))
         self._work = np.zeros((12, 4))
         self._motion = np.zeros((5, 3))
-        # Frames are copied here first: a read-only or strided array would be another type for the compiler.
-        self._now = np.full((count, 3), np.nan)
-        self._quaternions = np.full((count, 4), np.nan)
         self.states: IntArray = np.full(count, _MISSING, np.int64)
-        self.reset()
+        self.arrays: tuple[FloatArray | IntArray, ...] = (
+            np.full((count, 3), np.nan), np.full((count, 4), np.nan), self._rest, self._rest_quaternions,
+            self._limits, self._memory, self._work, self._motion, self.states,
+        )  # fmt: skip
 
     def reset(self) -> None:
         """Forgets the last motion and what has slipped."""
         self._memory[:] = 0.0
         self._motion[:] = 0.0
         self.states[:] = _MISSING
-
-    @property
-    def residual_mm(self) -> float:
-        """Of the last frame: mean distance of the references that count from where the motion takes them."""
-        return float(self._motion[_RESIDUAL])
-
-    def step(
-        self,
-        references: FloatArray,
-        rotation: FloatArray,
-        translation: FloatArray,
-        quaternions: FloatArray | None = None,
-    ) -> int:
-        """Fills rotation (3, 3) and translation (3,), mm: now = rotation @ rest + translation; the `HeadStatus`.
-
-        references: (k, 3) mm in the source's frame, NaN = missing; quaternions: (k, 4) of 6-D ones, NaN = missing.
-        """
-        self._now[:] = references
-        self._quaternions[:] = np.nan if quaternions is None else quaternions
-        status = _step(
-            self._now, self._quaternions, self._rest, self._rest_quaternions, self._limits, self._memory,
-            self._work, self._motion, self.states,
-        )  # fmt: skip
-        rotation[:] = self._motion[:_TRANSLATION]
-        translation[:] = self._motion[_TRANSLATION]
-        return int(status)
 
     def _all_steps(self, references: FloatArray, quaternions: FloatArray, motion: HeadMotion) -> None:
         """The steps of a whole recording: references (frames, k, 3), quaternions (frames, k, 4)."""
@@ -216,7 +191,7 @@ def head_motion(
     rate_hz: float = USUAL_RATE_HZ,
     quaternions: FloatArray | None = None,
 ) -> HeadMotion:
-    """The motion over a recording, with the bits that `HeadCorrector` gives frame by frame.
+    """The motion over a recording, with the bits that `HeadCorrector` and `follow_head` give frame by frame.
 
     references: (frames, k, 3) mm, NaN = missing, in the order of `reference.roles`; quaternions: (frames, k, 4).
     """
@@ -444,7 +419,7 @@ def _all_steps(
     statuses: IntArray,
 ) -> None:
     for frame in range(references.shape[0]):
-        statuses[frame] = _step(
+        statuses[frame] = follow_head(
             references[frame], quaternions[frame], rest, rest_quaternions, limits, memory, work, motion,
             states[frame],
         )  # fmt: skip
@@ -454,7 +429,7 @@ def _all_steps(
 
 
 @njit(**OPTIONS)
-def _step(
+def follow_head(
     now: FloatArray,
     quaternions: FloatArray,
     rest: FloatArray,
@@ -467,7 +442,9 @@ def _step(
 ) -> int:
     """One frame: judges the references, then finds the motion; the `HeadStatus`.
 
-    limits: tolerance in mm, frames to slip, frames to return, jump in mm; motion: (5, 3) the last one, then this one.
+    now: (k, 3) mm in the source's frame, quaternions: (k, 4) of 6-D references, NaN = missing; limits: tolerance in mm,
+    frames to slip, frames to return, jump in mm; motion: (5, 3) the last one, then this one: its rows are the rotation,
+    the translation, then whether it is known, the mean residual in mm, the status.
     """
     _judge(now, rest, limits, memory, motion, states)
     counting = _weigh(limits[0], memory, states)

@@ -612,48 +612,47 @@ def solve_free_speaker(
 
 
 @njit(**OPTIONS)
-def prepare_frame(raw, picked, rotation, translation, project, coils):
-    """coils (n, 3) in the model frame from a source's raw (all coils, 3).
+def _place(x, y, z, rotation, translation, project, coil):
+    """coil (3,) in the model frame = rotation (3, 3) (x, y, z) + translation (3,), mm.
 
-    picked (n,): indices into raw; rotation (3, 3), translation (3,) mm: model = rotation raw +
-    translation; project: set the lateral coordinate to the mid-sagittal plane's 0. A coil with any
-    coordinate that is not a number, or beyond FARTHEST_MM, becomes all NaN.
+    project: set the lateral coordinate to the mid-sagittal plane's 0. With any coordinate that is not a number, or
+    beyond FARTHEST_MM, before or after, the coil becomes all NaN.
     """
-    for i in range(picked.shape[0]):
-        x = raw[picked[i], 0]
-        y = raw[picked[i], 1]
-        z = raw[picked[i], 2]
-        usable = True
+    usable = abs(x) <= FARTHEST_MM and abs(y) <= FARTHEST_MM and abs(z) <= FARTHEST_MM
+    for axis in range(3):
+        coil[axis] = rotation[axis, 0] * x + rotation[axis, 1] * y + rotation[axis, 2] * z + translation[axis]
+        usable = usable and abs(coil[axis]) <= FARTHEST_MM
+    if not usable:
         for axis in range(3):
-            coils[i, axis] = (
-                rotation[axis, 0] * x + rotation[axis, 1] * y + rotation[axis, 2] * z + translation[axis]
-            )
-            usable = (
-                usable and abs(raw[picked[i], axis]) <= FARTHEST_MM and abs(coils[i, axis]) <= FARTHEST_MM
-            )
-        if not usable:
-            for axis in range(3):
-                coils[i, axis] = np.nan
-        elif project:
-            coils[i, 0] = 0.0
+            coil[axis] = np.nan
+    elif project:
+        coil[0] = 0.0
+
+
+@njit(**OPTIONS)
+def prepare_frame(raw, picked, rotation, translation, project, coils):
+    """coils (n, 3) in the model frame from a source's raw (all coils, 3); picked (n,): indices into raw."""
+    for i in range(picked.shape[0]):
+        x, y, z = raw[picked[i], 0], raw[picked[i], 1], raw[picked[i], 2]
+        _place(x, y, z, rotation, translation, project, coils[i])
 
 
 @njit(**OPTIONS)
 def prepare_on_moving_head(
-    raw, picked, head_rotation, head_translation, rotation, translation, project, still, coils
+    raw, head_rotation, head_translation, picked, rotation, translation, project, coils
 ):
     """`prepare_frame` after the head's motion was taken out: rest = head_rotation' (raw - head_translation).
 
-    still: scratch (channels, 3). A frame whose motion is not known (NaN) has no coils.
+    A frame whose motion is not known (NaN) has no coils.
     """
     for i in range(picked.shape[0]):
-        channel = picked[i]
-        for axis in range(3):
-            total = 0.0
-            for row in range(3):
-                total += head_rotation[row, axis] * (raw[channel, row] - head_translation[row])
-            still[channel, axis] = total
-    prepare_frame(still, picked, rotation, translation, project, coils)
+        x = y = z = 0.0
+        for row in range(3):
+            off = raw[picked[i], row] - head_translation[row]
+            x += head_rotation[row, 0] * off
+            y += head_rotation[row, 1] * off
+            z += head_rotation[row, 2] * off
+        _place(x, y, z, rotation, translation, project, coils[i])
 
 
 @njit(**OPTIONS)
@@ -661,6 +660,18 @@ def prepare_frames(raw, picked, rotation, translation, project, coils):
     """`prepare_frame` for raw (frames, all coils, 3) into coils (frames, n, 3)."""
     for frame in range(raw.shape[0]):
         prepare_frame(raw[frame], picked, rotation, translation, project, coils[frame])
+
+
+@njit(**OPTIONS)
+def prepare_frames_on_moving_head(
+    raw, head_rotations, head_translations, picked, rotation, translation, project, coils
+):
+    """`prepare_on_moving_head` for raw (frames, all coils, 3) into coils (frames, n, 3)."""
+    for frame in range(raw.shape[0]):
+        prepare_on_moving_head(
+            raw[frame], head_rotations[frame], head_translations[frame], picked, rotation, translation, project,
+            coils[frame],
+        )  # fmt: skip
 
 
 @njit(**OPTIONS)

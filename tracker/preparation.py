@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from .. import InputError
 from . import kernels
-from .headcorrection import HeadCorrector, HeadReference, ReferenceState, head_motion
+from .headcorrection import HeadCorrector, HeadReference, IntArray, ReferenceState, follow_head, head_motion
 from .pose import FloatArray
 from .session import Alignment
 from .smoothing import NO_SMOOTHING, CausalSmoother, Filter, Smoothing, smooth
@@ -44,9 +45,6 @@ class Preparation:
         self._head = head
         self._references = np.zeros(0, np.int64) if references is None else np.ascontiguousarray(references)
         self._corrector = HeadCorrector(head, rate_hz) if head is not None else None
-        self._head_rotation, self._head_translation = np.eye(3), np.zeros(3)
-        self._reference_positions = np.full((len(self._references), 3), np.nan)
-        self._reference_quaternions = np.full((len(self._references), 4), np.nan)
         self._smoothing = smoothing
         # Channels in the order in which a frame is copied, with the role that says how each is smoothed.
         head_roles = head.roles if head is not None else ()
@@ -55,10 +53,12 @@ class Preparation:
         self.coils: FloatArray = np.full((len(self._picked), 3), np.nan)
         # Frames are copied here first: a read-only or strided array would be another type for the compiler.
         self._raw = np.zeros((self.channels_needed, 3))
-        self._still = np.zeros_like(self._raw)
+        self._quaternions = np.full((self.channels_needed, 4), np.nan)
         live = [self._filter_of(channel, live=True) for channel in range(self.channels_needed)]
         self._smoother = CausalSmoother(live, rate_hz) if any(live) else None
-        self._smooth_raw = np.zeros_like(self._raw)
+        # What the compiled calls are given: gathering it anew would cost as much as they do.
+        self._place = (self._picked, self._rotation, self._translation, self._midsagittal)
+        self._on_head = () if self._corrector is None else (self._references, *self._corrector.arrays)
 
     def _filter_of(self, channel: int, live: bool) -> Filter | None:
         role = self._role_of.get(channel)
@@ -92,34 +92,22 @@ class Preparation:
         step_s: time since the frame before, for smoothing; quaternions: (all coils, 4), for a reference with
         six degrees of freedom.
         """
-        if len(raw) < len(self._raw):
+        needed = len(self._raw)
+        if len(raw) < needed:
             raise InputError(
-                f"a frame has {len(raw)} coils, but channel {len(self._raw)} is to be tracked; check what the "
-                "source sends."
+                f"a frame has {len(raw)} coils, but channel {needed} is to be tracked; check what the source sends."
             )
-        self._raw[:] = raw[: len(self._raw)]
-        used = self._raw
+        self._raw[...] = raw[:needed]
         if self._smoother is not None:
-            self._smoother.step(self._raw, step_s, self._smooth_raw)
-            used = self._smooth_raw
+            self._smoother.step(self._raw, step_s, self._raw)
         if self._corrector is None:
-            kernels.prepare_frame(
-                used, self._picked, self._rotation, self._translation, self._midsagittal, self.coils
-            )
+            kernels.prepare_frame(self._raw, *self._place, self.coils)
             return self.coils
-        np.take(used, self._references, axis=0, out=self._reference_positions)
         if quaternions is not None:
-            np.take(quaternions, self._references, axis=0, out=self._reference_quaternions)
-        self._corrector.step(
-            self._reference_positions,
-            self._head_rotation,
-            self._head_translation,
-            None if quaternions is None else self._reference_quaternions,
+            self._quaternions[...] = quaternions[:needed]
+        _prepare_on_head(
+            self._raw, self._quaternions, quaternions is not None, *self._on_head, *self._place, self.coils
         )
-        kernels.prepare_on_moving_head(
-            used, self._picked, self._head_rotation, self._head_translation, self._rotation, self._translation,
-            self._midsagittal, self._still, self.coils,
-        )  # fmt: skip
         return self.coils
 
     def all_frames(
@@ -133,16 +121,47 @@ class Preparation:
             raw = np.ascontiguousarray(smooth(raw[:, : self.channels_needed], rate_hz, filters))
         prepared = np.empty((len(raw), len(self._picked), 3))
         if self._head is None:
-            kernels.prepare_frames(
-                raw, self._picked, self._rotation, self._translation, self._midsagittal, prepared
-            )
+            kernels.prepare_frames(raw, *self._place, prepared)
             return prepared
         turned = None if quaternions is None else quaternions[:, self._references]
         motion = head_motion(raw[:, self._references], self._head, rate_hz, turned)
-        still = np.zeros(raw.shape[1:])
-        for frame in range(len(raw)):
-            kernels.prepare_on_moving_head(
-                raw[frame], self._picked, motion.rotations[frame], motion.translations[frame], self._rotation,
-                self._translation, self._midsagittal, still, prepared[frame],
-            )  # fmt: skip
+        kernels.prepare_frames_on_moving_head(
+            raw, motion.rotations, motion.translations, *self._place, prepared
+        )
         return prepared
+
+
+@njit(**kernels.OPTIONS)
+def _prepare_on_head(
+    raw: FloatArray,
+    quaternions: FloatArray,
+    turned: bool,
+    references: IntArray,
+    now: FloatArray,
+    now_turned: FloatArray,
+    rest: FloatArray,
+    rest_turned: FloatArray,
+    limits: FloatArray,
+    memory: FloatArray,
+    work: FloatArray,
+    motion: FloatArray,
+    states: IntArray,
+    picked: IntArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    midsagittal: bool,
+    coils: FloatArray,
+) -> None:
+    """One frame raw (channels, 3) from the references to the coils (n, 3) in the model frame.
+
+    turned: whether quaternions (channels, 4) are this frame's; now to states: `HeadCorrector.arrays`.
+    """
+    for i in range(references.shape[0]):
+        for axis in range(3):
+            now[i, axis] = raw[references[i], axis]
+        for part in range(4):
+            now_turned[i, part] = quaternions[references[i], part] if turned else np.nan
+    follow_head(now, now_turned, rest, rest_turned, limits, memory, work, motion, states)
+    kernels.prepare_on_moving_head(
+        raw, motion[:3], motion[3], picked, rotation, translation, midsagittal, coils
+    )
