@@ -14,7 +14,7 @@ from tonguetrack.drivers import FrameOfReference, Recording, open_recording, wri
 from tonguetrack.model.files import save_model
 from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.calibration import Sources, calibrate
-from tonguetrack.tracker.calibrationreport import REPORT_FILES
+from tonguetrack.tracker.calibrationreport import REPORT_FILES, draw_residuals, draw_views
 from tonguetrack.tracker.cli import main
 from tonguetrack.tracker.headcorrection import head_motion
 from tonguetrack.tracker.session import Alignment, load_session
@@ -232,6 +232,40 @@ def test_the_report_has_its_page_and_its_pictures(calibrated):
     assert "head_left slipped" in page
 
 
+def test_the_last_line_says_what_to_do_next(calibrated):
+    place, _, _, words = calibrated
+    last = words.splitlines()[-1]
+    assert f"look at {place / 'report' / 'report.md'}" in last
+    assert f"tonguetrack track {place / 'take.npz'} --session {place / 'session.toml'}" in last
+
+
+@pytest.fixture(scope="module")
+def drawn(files, small_model):
+    """A calibration as the pictures are drawn from it."""
+    take = open_recording(files[0] / "take.npz")
+    return calibrate([take, take], small_model, frame=FrameOfReference("right", "back", "up"))
+
+
+def test_before_and_after_the_fit_are_drawn_on_the_same_axes(drawn, small_model):
+    pytest.importorskip("matplotlib")
+    figure = draw_views(drawn, small_model)
+    figure.draw_without_rendering()
+    before_side, before_front, after_side, after_front = figure.axes
+    for before, after in ((before_side, after_side), (before_front, after_front)):
+        assert before.get_xlim() == after.get_xlim() and before.get_ylim() == after.get_ylim()
+
+
+def test_the_residuals_axis_reaches_nearly_all_samples_and_recordings_are_told_apart(drawn):
+    pytest.importorskip("matplotlib")
+    over_time, *by_coil = draw_residuals(drawn).axes
+    for which, panel in enumerate(by_coil, 1):
+        each = np.concatenate([run[which].residuals_mm.ravel() for run in drawn.poses])
+        assert np.mean(each[np.isfinite(each)] <= panel.get_xlim()[1]) >= 0.99
+    length_s = drawn.poses[0][1].times_s[-1] + 1.0 / RATE_HZ
+    bounds = [line.get_xdata()[0] for line in over_time.lines if len(set(line.get_xdata())) == 1]
+    np.testing.assert_allclose(bounds, [length_s])
+
+
 # What is refused ------------------------------------------------------------------------------------
 
 
@@ -339,6 +373,23 @@ def test_a_palate_sweep_without_the_reference_coils(files, small_model, tmp_path
             Sources(palate=tmp_path / "alone.npz"),
             frame=FrameOfReference("right", "back", "up"),
         )
+
+
+def test_a_recording_named_twice_a_folder_as_session_and_a_report_in_the_sessions_place(
+    files, capsys, tmp_path
+):
+    take = str(files[0] / "take.npz")
+    assert main(["calibrate", take, take, "-o", str(tmp_path / "session.toml")]) == 2
+    assert "this recording is named twice" in capsys.readouterr().err
+    page = str(tmp_path / "new" / "report.md")
+    for flags, words in (
+        (["-o", str(tmp_path)], "this is a folder"),
+        (["-o", page, "--report", str(tmp_path / "new")], "goes there; choose another name"),
+        (["-o", str(tmp_path / "one"), "--report", str(tmp_path / "one")], "goes there; choose another name"),
+    ):
+        assert main(["calibrate", take, "--frame", "right back up", *flags]) == 2
+        assert words in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_recording_is_never_overwritten(files, capsys):
