@@ -38,6 +38,7 @@ PICTURES = {
 REPORT_FILES = ("report.md", *PICTURES)
 MOST_POINTS = 1500  # of one cloud
 MOST_CONTOURS = 120
+LEAST_WIDTH_MM = 24.0  # of a view from the front
 LIMITS_MM = (1.25, 1.5)  # the paper's, of experiments 1 and 2
 LEAST_SHOWN_MM, SHOWN_PERCENT = (
     3.0,
@@ -117,8 +118,9 @@ def draw_views(calibration: Calibration, model: TongueModel) -> Figure:
     """Two rows (before and after the fit), two columns (from the side, from the front)."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 8.4), layout="constrained")
-    panels = figure.subplots(2, 2, sharey=True, width_ratios=(2.0, 1.0))
+    figure = Figure(figsize=(9, 8.4), layout="constrained")
+    # The same axes in both rows, so that the eye sees what the fit does.
+    panels = figure.subplots(2, 2, sharex="col", sharey=True)
     fit, alignment = calibration.registration, calibration.session.alignment
     placed = calibration.coils_mm @ calibration.base_rotation.T + calibration.base_translation_mm
     aligned = calibration.coils_mm @ alignment.rotation.T + alignment.translation_mm
@@ -143,14 +145,15 @@ def draw_views(calibration: Calibration, model: TongueModel) -> Figure:
                 panel.plot(above[:, axis], above[:, 2], color="0.45", linewidth=2.5, label="palate")
             panel.set_title(f"{name}, {side}")
             panel.set_xlabel(("x (left), mm", "y (back), mm")[axis])
-            panel.set_aspect("equal", adjustable="datalim")
+            panel.tick_params(labelbottom=True)
+            panel.set_aspect("equal")
             panel.grid(color="0.92")
         row[0].set_ylabel("z (up), mm")
-    for column in panels.T:  # the same place in both rows, so that the eye sees the fit
-        corners = np.concatenate([panel.dataLim.get_points() for panel in column])
-        for panel in column:
-            panel.update_datalim(corners)
-            panel.autoscale_view()
+    # Coils in one plane are a line from the front, which needs some room to its sides.
+    left, right = panels[0, 1].get_xlim()
+    room = max(0.0, LEAST_WIDTH_MM - (right - left)) / 2
+    panels[0, 1].set_xlim(left - room, right + room)
+    panels[0, 0].get_gridspec().set_width_ratios([np.ptp(panel.get_xlim()) for panel in panels[0]])
     _legend_below(figure, panels[0, 0], columns=5)
     return figure
 
