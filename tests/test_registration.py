@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 
 from tonguetrack import InputError
 from tonguetrack.model.midsagittal import midsagittal_vertices
@@ -72,6 +73,52 @@ def test_a_motion_within_a_bite_planes_uncertainty_is_undone(model, seed, motion
     assert found.vertices == tuple(vertices)
     assert found.residual_mm < 1.0
     assert np.isnan(found.palate_margin_mm)
+
+
+def spoken(model, seed, noise_mm=0.15, seconds=8.0, places=(9.0, 26.0, 46.0, 57.0)):
+    """(frames, n, 3) mm of a speaker of the model who goes from one training pose to the next five times a second, at
+    250 Hz, and the vertices: neighbouring frames show nearly the same pose, as in speech."""
+    random = np.random.default_rng(seed)
+    contour = midsagittal_vertices(model)
+    points = model.mean_vertices()[contour]
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    vertices = [int(contour[np.argmin(np.abs(along - place))]) for place in places]
+    away = 0.6 * random.normal(size=model.speaker.size).clip(-2, 2)
+    speaker = model.speaker.mean + model.speaker.measured_sigma * away
+    targets = model.pose.training[random.integers(0, model.pose.entries, int(5 * seconds) + 2)]
+    times = np.arange(int(250 * seconds)) / 50.0
+    poses = PchipInterpolator(np.arange(len(targets)), targets)(times)
+    coils = model.at(vertices)
+    coils = np.array([coils.vertices(speaker, pose) for pose in poses])
+    return coils + random.normal(0, noise_mm, coils.shape) * [0, 1, 1], vertices, speaker
+
+
+@pytest.mark.parametrize("seed", [1, 5])
+def test_four_coils_of_any_speaker_of_the_model_place_themselves_to_0_3_mm_and_half_a_degree(model, seed):
+    coils, vertices, _ = spoken(model, seed)
+    moved, rotation, _ = displaced(coils, 2.5, -2.0, 4.0)
+    found = fit_alignment(model, moved, (*ROLES, "tongue_back"), NEAR, Energy())
+    y, z, turned = errors(found, moved, coils, rotation)
+    assert max(y, z) < 0.3
+    assert turned < 0.5
+    assert found.vertices == tuple(vertices)
+
+
+@pytest.mark.parametrize("seed", [1, 6])
+def test_three_coils_of_a_speaker_of_the_model_are_as_far_off_as_they_are_said_to_be(model, seed):
+    """They leave some tenths of a millimetre open, and one has to be told so: 3 standard deviations at most."""
+    coils, _, _ = spoken(model, seed, places=(9.0, 26.0, 46.0))
+    moved, rotation, _ = displaced(coils, -2.0, 2.0, -3.0)
+    found = fit_alignment(model, moved, ROLES, NEAR, Energy())
+    assert np.all(errors(found, moved, coils, rotation) < 3.0 * found.sure)
+    assert found.sure.max() < 0.6
+
+
+def test_a_tongue_that_never_moves_says_little_however_long_it_is_recorded(model):
+    """A thousand copies of a frame are one frame."""
+    coils, _ = coils_of(model, 0, frames=1)
+    found = fit_alignment(model, np.repeat(coils, 1000, axis=0), ROLES, NEAR, Energy())
+    assert found.sure.min() > 0.5
 
 
 def test_from_axes_alone_a_motion_of_tens_of_millimetres_is_undone(model):

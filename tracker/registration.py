@@ -10,7 +10,8 @@ about as closely as it follows the right ones. What tells a good place from a ba
 how unusual poses it takes. So this is minimised, the negative logarithm of a posterior:
 
     J(motion, vertices, s) =
-          N * mean over frames of -log Normal(motion(q_t); v(s, p_mean), noise^2 I + D(s) Sigma_p D(s)')
+          P * mean over frames of -log Normal(motion(q_t); v(s, p_mean), noise^2 I + D(s) Sigma_p D(s)')
+        + (N - P) * mean over frames of -log Normal(what of motion(q_t) - v(s, p_mean) no pose can follow; 0, noise^2 I)
         + |s - s_mean|^2 / (2 sigma_s^2)
         + |motion - guess|^2 / (2 sd^2)
         + (place of the tip coil - usual)^2 / (2 sd^2)    mm along the contour: coils can slide, and the motion with them
@@ -20,9 +21,10 @@ The poses are integrated out: D(s) = d v / d p at the coils, sigma_s and Sigma_p
 weights. (With the best pose instead, a larger speaker who moves less would win, however exact the coils.) The frames
 enter by their mean and covariance alone, which is why this is fast. What parts coils and vertices is mostly what the
 model cannot express, and that is the same in every frame: T frames say no more than N = T / (1 + (T - 1) r)
-independent ones, where r is the share of the noise that is not the device's own. The noise is estimated from the
-residuals, so coils that the model can express place themselves to a fraction of a millimetre, and those of a stranger
-stay near their bite plane. Scale is not fitted.
+independent ones, where r is the share of the noise that is not the device's own. How usual the poses are is told by
+fewer still, P, for neighbouring frames show the same pose: reckoned alike, from as many frames as their
+autocorrelation leaves. The noise is estimated from the residuals, so coils that the model can express place themselves
+to a fraction of a millimetre, and those of a stranger stay near their bite plane. Scale is not fitted.
 """
 
 from __future__ import annotations
@@ -46,6 +48,7 @@ from .kernels import OPTIONS
 from .palate import Palate
 from .pose import FloatArray
 from .session import Energy
+from .speakers import effective_frames
 
 SHOWN_FRAMES = 120  # spread through the recording: for the palate, and for the speaker that is told
 MOST_INDEPENDENT = 1000  # frames; a recording has more only on paper
@@ -70,6 +73,7 @@ COOLING = 0.6  # by which the noise may fall between two slides: with less noise
 FULL_STEPS, TRIAL_STEPS = 60, 12  # of a descent; of one that only compares places
 UNITS = (2.0, 0.05)  # mm and radians of one step of the search
 DIFFERENCE = 1e-5
+CURVATURE_STEP = 0.02  # in units of the search: less than the kinks of the palate, more than rounding
 FAR_FROM_GUESS = 2.5  # standard deviations
 
 
@@ -264,13 +268,22 @@ def _settled(posterior: Callable[[], _Posterior]) -> tuple[_Posterior, _Found]:
     return min(settled, key=lambda one: one[0].value(one[1].unknowns, one[1].places, noise))
 
 
-class FrameTerms(NamedTuple):
-    """value: of the mean frame; slope: (m,) its derivatives in the raw speaker weights; off: (axes,) to be added to
-    coils for their deviation from what is expected; gain: (n, axes) of the pose; inverse: (axes, axes) of the
-    expected covariance; directions: (n, axes) d v / d p."""
+class Term(NamedTuple):
+    """value: of the mean frame; slope: (m,) its derivatives in the raw speaker weights; motion_slope: (4, 3) those in
+    the rotation matrix, then in the translation."""
 
     value: float
     slope: FloatArray
+    motion_slope: FloatArray
+
+
+class FrameTerms(NamedTuple):
+    """whole: -log Normal of coils in any pose; beside: of what no pose can follow; off: (axes,) to be added to
+    coils for their deviation from what is expected; gain: (n, axes) of the pose; inverse: (axes, axes) of the
+    expected covariance; directions: (n, axes) d v / d p."""
+
+    whole: Term
+    beside: Term
     off: FloatArray
     gain: FloatArray
     inverse: FloatArray
@@ -295,7 +308,7 @@ def mean_frame(
     frames_mean: FloatArray, frames_covariance: FloatArray, rotation: FloatArray, translation: FloatArray,
     axes: NDArray[np.int64], noise_mm: float,
 ) -> FrameTerms:  # fmt: skip
-    """-log Normal of the mean frame: core (m, n, a) and origin (a,) at the coils' measured axes (a,), which are
+    """The terms of the mean frame: core (m, n, a) and origin (a,) at the coils' measured axes (a,), which are
     indices into the coordinates (3n,) of frames_mean and frames_covariance, these before the motion."""
     speakers, poses, size = core.shape
     turned = np.zeros((size, frames_mean.shape[0]))
@@ -318,11 +331,37 @@ def mean_frame(
     value = 0.5 * (np.sum(inverse * spread) + np.sum(off * pull) - np.linalg.slogdet(inverse)[1])
     narrower = inverse - inverse @ spread @ inverse - np.outer(pull, pull)
     by_direction = answering @ narrower - np.outer(pose_mean, pull)
-    slope = np.zeros(speakers)
+    # The best of all poses, usual or not, leaves what is across their directions.
+    following = np.linalg.pinv(directions)
+    across = (np.eye(size) - following @ directions) / noise_mm**2
+    left = across @ off
+    beside = 0.5 * (np.sum(across * spread) + np.sum(off * left)) + np.trace(across) * noise_mm**2 * np.log(
+        noise_mm
+    )
+    moments = spread + np.outer(off, off)
+    beside_by_direction = -np.outer(pose_mean, left) - following.T @ moments @ across
+    slopes = np.zeros((2, speakers))
     for weight in range(speakers):
-        slope[weight] = np.sum(core[weight] * by_direction)
+        slopes[0, weight] = np.sum(core[weight] * by_direction)
+        slopes[1, weight] = np.sum(core[weight] * beside_by_direction)
+    # Both are quadratic in the coils, with these matrices.
+    quadratics = np.empty((2, size, size))
+    quadratics[0], quadratics[1] = inverse, across
+    motion_slopes = np.zeros((2, 4, 3))
+    for term in range(2):
+        by_turned = quadratics[term] @ turned @ frames_covariance
+        by_middle = quadratics[term] @ off
+        for row in range(size):
+            coil, axis = axes[row] // 3, axes[row] % 3
+            motion_slopes[term, 3, axis] += by_middle[row]
+            for other in range(3):
+                motion_slopes[term, axis, other] += by_turned[row, 3 * coil + other]
+                motion_slopes[term, axis, other] += by_middle[row] * frames_mean[3 * coil + other]
     # The most probable pose = mean + gain @ (coils - expected).
-    return FrameTerms(value, slope, -expected_middle, answering @ inverse, inverse, directions)  # type: ignore[arg-type]
+    return FrameTerms(
+        Term(value, slopes[0], motion_slopes[0]), Term(beside, slopes[1], motion_slopes[1]), -expected_middle,
+        answering @ inverse, inverse, directions,
+    )  # type: ignore[arg-type]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -391,6 +430,8 @@ class _Posterior:
         self._axes = np.flatnonzero(np.tile([not midsagittal, True, True], len(roles))).astype(np.int64)
         self.noise_mm = MODEL_NOISE_MM
         self._at_places: dict[Places, tuple[FloatArray, FloatArray]] = {}
+        series = self._coils.reshape(len(self._coils), -1)[:, self._axes]
+        self._poses_seen = float(np.median(effective_frames(series)))
         self._summarise(_near_their_medians(self._coils))
 
     def _summarise(self, kept: NDArray[np.bool_]) -> None:
@@ -465,10 +506,9 @@ class _Posterior:
 
     # J ----------------------------------------------------------------------------------------------
 
-    @property
-    def _independent_frames(self) -> float:
-        """N: how many independent frames those of the recording are worth."""
-        frames = min(self._frames, MOST_INDEPENDENT)
+    def _independent(self, frames: float) -> float:
+        """How many independent frames so many are worth: N for those of the recording, P for the poses seen."""
+        frames = min(frames, MOST_INDEPENDENT)
         repeated = 1.0 - min(DEVICE_NOISE_MM / self.noise_mm, 1.0) ** 2
         return frames / (1.0 + (frames - 1) * repeated)
 
@@ -479,28 +519,55 @@ class _Posterior:
     def value(self, unknowns: FloatArray, places: Places, noise_mm: float) -> float:
         """J with another noise."""
         own, self.noise_mm = self.noise_mm, noise_mm
-        value = self._value_and_slope(unknowns, places)[0]
+        value = self._value(unknowns, places)[0]
         self.noise_mm = own
         return value
 
-    def _value_and_slope(self, unknowns: FloatArray, places: Places) -> tuple[float, FloatArray, bool]:
-        """J, its derivatives in the speaker (in measured sigma) without the palate's, whether the palate has a say."""
-        bound = False
+    def _value(self, unknowns: FloatArray, places: Places) -> tuple[float, FrameTerms, float]:
+        """J; of it, the frames' terms and the palate's part."""
         frame = self._frame_terms(unknowns, places, self.noise_mm)
-        speaker = unknowns[self.size :]
-        value = self._independent_frames * frame.value + 0.5 * float(speaker @ speaker)
+        poses, frames = self._independent(self._poses_seen), self._independent(self._frames)
+        value = poses * frame.whole.value + (frames - poses) * frame.beside.value
+        value += 0.5 * float(np.sum(unknowns[self.size :] ** 2))
         value += 0.5 * float(np.sum((unknowns[: self.size] / self._sd) ** 2))
         for index in self._middle:
             value += 0.5 * float(self._mean[places[index], 0] ** 2) / ASIDE_SD_MM**2
             if self._roles[index] == "tongue_tip":
                 slid = self._along[places[index]] - USUAL_PLACES_MM["tongue_tip"]
                 value += 0.5 * (slid / TIP_PLACE_SD_MM) ** 2
+        bound = 0.0
         if self._palate is not None:
             heights = np.sort(self._heights(unknowns, frame))
             worst = heights[-max(1, round(WORST_SHARE * len(heights))) :]
-            bound = bool(worst[-1] > 0.0)
-            value += 0.5 * (float(np.maximum(worst, 0.0).mean()) / PALATE_SD_MM) ** 2
-        return value, self._independent_frames * frame.slope * self._speaker_sd + speaker, bound
+            bound = 0.5 * (float(np.maximum(worst, 0.0).mean()) / PALATE_SD_MM) ** 2
+        return value + bound, frame, bound
+
+    def _value_and_slope(self, unknowns: FloatArray, places: Places) -> tuple[float, FloatArray]:
+        """J and its derivatives (k,): exact, but the palate's part by differences."""
+        value, frame, bound = self._value(unknowns, places)
+        poses, frames = self._independent(self._poses_seen), self._independent(self._frames)
+        speaker_slope, by_motion = (
+            poses * whole + (frames - poses) * beside
+            for whole, beside in zip(frame.whole[1:], frame.beside[1:], strict=True)
+        )
+        slope = np.concatenate([unknowns[: self.size] / self._sd**2, unknowns[self.size :]])
+        slope[: self._shifts] += by_motion[3, -self._shifts :]
+        for index in range(self._shifts, self.size):
+            ahead, behind = unknowns.copy(), unknowns.copy()
+            ahead[index] += DIFFERENCE
+            behind[index] -= DIFFERENCE
+            (rotation, translation), (rotation_before, translation_before) = (
+                self._rigid(ahead), self._rigid(behind),
+            )  # fmt: skip
+            turned = np.vstack([rotation - rotation_before, translation - translation_before])
+            slope[index] += float(np.sum(by_motion * turned)) / (2.0 * DIFFERENCE)
+        slope[self.size :] += speaker_slope * self._speaker_sd
+        if bound > 0.0:
+            for index, unit in enumerate(self._units):
+                there = unknowns.copy()
+                there[index] += DIFFERENCE * unit
+                slope[index] += (self._value(there, places)[2] - bound) / (DIFFERENCE * unit)
+        return value, slope
 
     def _frame_terms(self, unknowns: FloatArray, places: Places, noise_mm: float) -> FrameTerms:
         """The mean over the frames of their negative log likelihood, up to a constant."""
@@ -554,7 +621,7 @@ class _Posterior:
     def _descend(
         self, unknowns: FloatArray, places: Places, steps: int = FULL_STEPS, scaling: FloatArray | None = None
     ) -> tuple[FloatArray, float]:
-        """BFGS; the speaker's derivatives are exact unless the palate has a say, the motion's by differences.
+        """BFGS.
 
         scaling: (k, k), J is about round in scaling^-1 @ unknowns; None where that is not known yet.
         """
@@ -563,14 +630,7 @@ class _Posterior:
         scaling = np.diag(self._units) if scaling is None else scaling
 
         def value_and_slope(scaled: FloatArray) -> tuple[float, FloatArray]:
-            here = unknowns + scaling @ scaled
-            value, speaker_slope, bound = self._value_and_slope(here, places)
-            slope = np.concatenate([np.zeros(self.size), speaker_slope])
-            for index in range(len(here) if bound else self.size):
-                there = here.copy()
-                step = DIFFERENCE * self._units[index]
-                there[index] += step
-                slope[index] = (self._value_and_slope(there, places)[0] - value) / step
+            value, slope = self._value_and_slope(unknowns + scaling @ scaled, places)
             return value, scaling.T @ slope
 
         end = minimize(
@@ -666,7 +726,8 @@ class _Posterior:
         self._summarise(kept)
         # The recording's own poses count beside those of the model's training by how many they are.
         training = self._model.pose
-        own = self._independent_frames / (self._independent_frames + training.entries)
+        seen = self._independent(self._poses_seen)
+        own = seen / (seen + training.entries)
         poses = self._pose_mean + off[kept] @ frame.gain.T
         unsure = self._pose_covariance - frame.gain @ frame.directions.T @ self._pose_covariance
         mean = (1.0 - own) * training.mean + own * poses.mean(axis=0)
@@ -677,27 +738,19 @@ class _Posterior:
         self._pose_mean = mean
         self._pose_covariance = (1.0 - own) * believed + own * (away.T @ away / len(away) + unsure)
         noises = NOISES_MM[NOISES_MM >= least_noise_mm]
-        likely = [self._frame_terms(unknowns, places, noise).value for noise in noises]
+        likely = [self._frame_terms(unknowns, places, noise).whole.value for noise in noises]
         self.noise_mm = float(noises[int(np.argmin(likely))])
 
     def _covariance(self, unknowns: FloatArray, places: Places) -> FloatArray:
         """(k, k) of the unknowns, from the curvature of J there; the vertices are held."""
-        step = 0.1
-        size = len(self._units)
-
-        def at(*moves: tuple[int, float]) -> float:
-            there = unknowns.copy()
-            for index, by in moves:
-                there[index] += by * step * self._units[index]
-            return self._value_and_slope(there, places)[0]
-
-        middle = at()
-        curvature = np.zeros((size, size))
-        for a in range(size):
-            curvature[a, a] = (at((a, 1)) - 2 * middle + at((a, -1))) / step**2
-            for b in range(a):
-                mixed = at((a, 1), (b, 1)) - at((a, 1), (b, -1)) - at((a, -1), (b, 1)) + at((a, -1), (b, -1))
-                curvature[a, b] = curvature[b, a] = mixed / (4 * step**2)
+        slopes = np.zeros((len(self._units),) * 2)
+        for index, unit in enumerate(self._units):
+            move = np.zeros(len(self._units))
+            move[index] = CURVATURE_STEP * unit
+            slopes[index] = self._value_and_slope(unknowns + move, places)[1]
+            slopes[index] -= self._value_and_slope(unknowns - move, places)[1]
+        curvature = slopes * self._units / (2.0 * CURVATURE_STEP)
+        curvature = 0.5 * (curvature + curvature.T)
         # The priors alone make every direction at least this curved; kinks of the palate must not undo that.
         values, vectors = np.linalg.eigh(curvature)
         least = float(min(1.0, np.min((self._units[: self.size] / self._sd) ** 2)))
