@@ -13,7 +13,7 @@ from tonguetrack import InputError
 from tonguetrack.drivers import FrameOfReference, Recording, open_recording, write_recording
 from tonguetrack.model.files import save_model
 from tonguetrack.tracker.bundled import bundled_model
-from tonguetrack.tracker.calibration import Sources, calibrate
+from tonguetrack.tracker.calibration import Figures, Sources, _doubt, calibrate
 from tonguetrack.tracker.calibrationreport import REPORT_FILES, draw_residuals, draw_views
 from tonguetrack.tracker.cli import main
 from tonguetrack.tracker.headcorrection import head_motion
@@ -236,7 +236,15 @@ def test_the_last_line_says_what_to_do_next(calibrated):
     place, _, _, words = calibrated
     last = words.splitlines()[-1]
     assert f"look at {place / 'report' / 'report.md'}" in last
-    assert f"tonguetrack track {place / 'take.npz'} --session {place / 'session.toml'}" in last
+    assert f"; then tonguetrack track {place / 'take.npz'} --session {place / 'session.toml'}" in last
+
+
+def test_a_fit_that_bends_the_model_or_stays_away_is_doubted(calibrated):
+    _, _, told, words = calibrated
+    good = Figures(**told["after"]["experiment_2"])
+    assert _doubt(good) == "" and "warning" not in words
+    assert "in 75 % of the frames a weight is beyond 3 sigma" in _doubt(replace(good, within_3_sigma=0.25))
+    assert "the session is of no use" in _doubt(replace(good, residual_mean_mm=12.0))
 
 
 @pytest.fixture(scope="module")
@@ -301,6 +309,15 @@ def test_axes_that_nobody_states_are_asked_for(refused):
 def test_a_bite_plane_of_another_speaker(refused):
     said = refused("--bite-plane", "other.npz")
     assert "other.npz" in said and "take.npz" in said and "different speakers" in said
+
+
+def test_a_rest_of_another_speaker(refused):
+    said = refused("--rest-file", "other.npz")
+    assert "take.npz" in said and "other.npz" in said and "different speakers" in said
+
+
+def test_a_file_whose_axes_are_no_sagittal_plane(refused):
+    assert "in the mid-sagittal plane" in refused(frame=("--frame", "left up"))
 
 
 def test_a_palate_below_the_tongue(refused):

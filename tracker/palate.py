@@ -284,6 +284,11 @@ def axes_from_words(text: str) -> FrameOfReference:
         )
     frame = FrameOfReference(words[0], words[1], words[2], "stated")
     directions(frame, f"axes {text!r}")
+    if "absent" in words and {"left", "right"} & set(words):
+        raise InputError(
+            f"axes {text!r}: two-dimensional data lie in the mid-sagittal plane, so their axes grow to the front or back "
+            'and up or down, as in "back up".'
+        )
     return frame
 
 
@@ -313,8 +318,8 @@ def _palate_from_trace(
     filled = [axis for axis, grows in enumerate((frame.x, frame.y, frame.z)) if grows != "absent"]
     if len(filled) != columns:
         raise InputError(
-            f"{source}: the trace has {columns} columns, but the axes ({frame}) are {len(filled)}; state the axes of its "
-            "columns."
+            f"{source}: the trace has {columns} columns, but the axes ({frame}) are {len(filled)}; a trace "
+            f"has the recording's axes, so write it with {len(filled)} columns."
         )
     points = np.zeros((len(table), 3))
     points[:, filled] = table * UNITS_MM[unit]

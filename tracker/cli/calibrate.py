@@ -123,30 +123,23 @@ def run_calibrate(args: argparse.Namespace) -> int:
 
         for file in write_report(found, model, Path(args.report)):
             print(f"  written: {file}", file=sys.stderr)
-    for line in next_steps(args.recordings[0], args.model, target, args.report):
-        print(f"  {line}", file=sys.stderr)
+    print(f"  {next_step(args)}", file=sys.stderr)
     if args.json:
         print(json.dumps({"model": model.name, "model_fingerprint": model.fingerprint, **found.as_dict()}))
     return 0
 
 
-def next_steps(recording: str, model: str, session: Path, report: str | None) -> list[str]:
+def next_step(args: argparse.Namespace) -> str:
     """What to look at, and the command that uses the session."""
     import shlex
 
-    with_model = [] if model == BUNDLED else ["--model", model]
-    command = [
-        "tonguetrack",
-        "track",
-        recording,
-        *with_model,
-        "--session",
-        str(session),
-        "--out",
-        "poses.csv",
-    ]
-    look = f"look at {Path(report) / 'report.md'} and its pictures" if report else "--report FOLDER draws it"
-    return [f"next: {look}; then {shlex.join(command)}"]
+    stated = {"--model": None if args.model == BUNDLED else args.model, "--rate": args.rate}
+    stated |= {"--unit": args.unit, "--layout": args.layout, "--session": args.output, "--out": "poses.csv"}
+    flags = [word for flag, value in stated.items() if value is not None for word in (flag, str(value))]
+    track = shlex.join(["tonguetrack", "track", args.recordings[0], *flags])
+    if args.report:
+        return f"next: look at {Path(args.report) / 'report.md'} and its pictures; then {track}"
+    return f"next: {track} (with --report FOLDER, calibrate draws what it found)"
 
 
 def parsed_interval(text: str) -> tuple[float, float]:
