@@ -30,6 +30,7 @@ RATE_HZ = 250.0
 TURN = Rotation.from_rotvec(np.radians([8.0, -6.0, 6.0])).as_matrix() @ np.diag([-1.0, 1.0, 1.0])
 SHIFT = np.array([120.0, -40.0, 300.0])
 SLIPPED_S = (2.0, 3.0)
+FILE_FRAME = FrameOfReference("right", "back", "up")
 
 
 def in_the_file(positions):
@@ -376,6 +377,82 @@ def test_words_that_are_no_interval(refused):
 def test_a_smoothing_that_does_not_exist(refused):
     said = refused("--smoothing", "loud")
     assert "--smoothing loud" in said and "none, carstens" in said
+
+
+def test_axes_that_contradict_the_coils_on_the_head(refused):
+    said = refused(frame=("--frame", "left back up"))
+    assert "take.npz" in said and "head_left is not to the left of head_right" in said and "--frame" in said
+    assert "head_nose is behind head_left and head_right" in refused(frame=("--frame", "right front up"))
+    assert "head_nose is below head_upper_incisor" in refused(frame=("--frame", "right back down"))
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_a_recording_in_another_unit(files, small_model, factor):
+    take = open_recording(files[0] / "take.npz")
+    with pytest.raises(InputError, match=r"take.npz: the tongue coils tongue_tip and .* mm apart.*--unit"):
+        calibrate([replace(take, positions=take.positions * factor)], small_model, frame=FILE_FRAME)
+
+
+def test_a_palate_sweep_without_two_of_three_references(files, small_model, tmp_path):
+    place, _ = files
+    sweep = open_recording(place / "palate.npz")
+    positions = sweep.positions.copy()
+    positions[:, -2:] = np.nan
+    write_recording(replace(sweep, positions=positions), tmp_path / "lost.npz")
+    with pytest.raises(
+        InputError, match=r"lost.npz: in no frame three of the reference coils .* where the head is"
+    ):
+        calibrate(
+            [open_recording(place / "take.npz")],
+            small_model,
+            Sources(palate=tmp_path / "lost.npz"),
+            frame=FILE_FRAME,
+        )
+
+
+# What is noted --------------------------------------------------------------------------------------
+
+
+def test_frames_in_which_the_head_is_carried_on_do_not_place_the_speaker(files, small_model):
+    """Two of four references are missing in the second half, and the head turns on: those frames would be wrong."""
+    take = open_recording(files[0] / "take.npz")
+    half = len(take.positions) // 2
+    positions = take.positions.copy()
+    positions[half:, [take.coils.index(role) for role in ("head_left", "head_nose")]] = np.nan
+    found = calibrate([replace(take, positions=positions)], small_model, frame=FILE_FRAME)
+    assert np.isnan(found.coils_mm[half:]).all() and np.isfinite(found.coils_mm[:half]).any()
+    left_out = next(one for one in found.decisions if "left out of the calibration" in one)
+    assert "take.npz" in left_out and "fewer than three references" in left_out
+
+
+def test_two_references_that_are_exchanged_in_the_middle_are_noted(files, small_model):
+    """The ears lie as mirror images, so no distance tells; that the head turns round within 4 ms does."""
+    take = open_recording(files[0] / "take.npz")
+    positions = take.positions[:500].copy()
+    positions[np.isnan(positions).any(axis=(1, 2))] = np.nan
+    left, right = (take.coils.index(role) for role in ("head_left", "head_right"))
+    whole = np.flatnonzero(np.isfinite(positions).all(axis=(1, 2)))
+    swap = whole[300]
+    assert whole[299] == swap - 1
+    positions[swap:, [left, right]] = positions[swap:, [right, left]]
+    short = replace(take, positions=positions, times_s=take.times_s[:500])
+    found = calibrate([short], small_model, frame=FILE_FRAME)
+    note = next(one for one in found.decisions if "jumps by" in one)
+    assert note.startswith("note: ") and f"at {swap / RATE_HZ:.2f} s" in note and "exchanged" in note
+
+
+def test_a_palate_that_was_drawn_beside_the_middle_is_noted(files, small_model, tmp_path):
+    place, _ = files
+    sweep = open_recording(place / "palate.npz")
+    positions = sweep.positions.copy()
+    positions[:, 0] += TURN @ [14.0, 0.0, 0.0]
+    write_recording(replace(sweep, positions=positions), tmp_path / "aside.npz")
+    take = open_recording(place / "take.npz")
+    for path, said in ((place / "palate.npz", False), (tmp_path / "aside.npz", True)):
+        found = calibrate([take], small_model, Sources(palate=path), frame=FILE_FRAME)
+        notes = [one for one in found.decisions if "too tightly" in one]
+        assert len(notes) == said
+        assert not said or "14 mm to the left" in notes[0]
 
 
 def test_a_palate_sweep_without_the_reference_coils(files, small_model, tmp_path):

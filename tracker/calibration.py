@@ -590,9 +590,9 @@ def _check_sides(
             wrong = "head_left is not to the left of head_right"
         elif "head_nose" in places and places["head_nose"][1] > middle[1]:
             wrong = "head_nose is behind head_left and head_right"
-    if not wrong and {"head_nose", "head_upper_incisor"} <= set(places):
-        if places["head_nose"][2] < places["head_upper_incisor"][2]:
-            wrong = "head_nose is below head_upper_incisor"
+    middle_coils = {"head_nose", "head_upper_incisor"} <= set(places)
+    if middle_coils and places["head_nose"][2] < places["head_upper_incisor"][2]:
+        wrong = wrong or "head_nose is below head_upper_incisor"
     if wrong:
         raise InputError(
             f"{recording.source}: with its axes (x {axes.x}, y {axes.y}, z {axes.z}), {wrong}; the axes are others, which "
