@@ -430,8 +430,7 @@ class _Posterior:
         self._axes = np.flatnonzero(np.tile([not midsagittal, True, True], len(roles))).astype(np.int64)
         self.noise_mm = MODEL_NOISE_MM
         self._at_places: dict[Places, tuple[FloatArray, FloatArray]] = {}
-        series = self._coils.reshape(len(self._coils), -1)[:, self._axes]
-        self._poses_seen = float(np.median(effective_frames(series)))
+        self._poses_seen = _poses_seen(self._coils.reshape(len(self._coils), -1)[:, self._axes])
         self._summarise(_near_their_medians(self._coils))
 
     def _summarise(self, kept: NDArray[np.bool_]) -> None:
@@ -737,6 +736,8 @@ class _Posterior:
         )
         self._pose_mean = mean
         self._pose_covariance = (1.0 - own) * believed + own * (away.T @ away / len(away) + unsure)
+        if self._poses_seen * (len(self._axes) - training.size) <= len(self._units):
+            return  # motion and speaker follow so few poses whatever the noise is
         noises = NOISES_MM[NOISES_MM >= least_noise_mm]
         likely = [self._frame_terms(unknowns, places, noise).whole.value for noise in noises]
         self.noise_mm = float(noises[int(np.argmin(likely))])
@@ -778,6 +779,13 @@ def _shapes(model: TongueModel, speaker: FloatArray, poses: FloatArray) -> Float
     """(T, V, 3) mm: the model's vertices for one speaker (m,) in the poses (T, n)."""
     directions = np.tensordot(speaker, model.core, axes=1)
     return np.asarray((model.origin + poses @ directions).reshape(len(poses), -1, 3))
+
+
+def _poses_seen(series: FloatArray) -> float:
+    """How many independent poses coils (T, a) mm show: a movement within the device's noise is none."""
+    moving = float(np.median(series.var(axis=0)))
+    shown = max(0.0, 1.0 - DEVICE_NOISE_MM**2 / max(moving, 1e-12))
+    return 1.0 + (float(np.median(effective_frames(series))) - 1.0) * shown
 
 
 def _near_their_medians(coils: FloatArray) -> NDArray[np.bool_]:
