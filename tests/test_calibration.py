@@ -255,6 +255,12 @@ def drawn(files, small_model):
     return calibrate([take, take], small_model, frame=FrameOfReference("right", "back", "up"))
 
 
+def test_the_session_says_on_how_many_recordings_it_was_found(drawn):
+    frames = sum(len(run[1].times_s) for run in drawn.poses)
+    assert f"over {frames} frames of " in drawn.session.speaker_source
+    assert drawn.session.speaker_source.endswith("take.npz and 1 more")
+
+
 def test_before_and_after_the_fit_are_drawn_on_the_same_axes(drawn, small_model):
     pytest.importorskip("matplotlib")
     figure = draw_views(drawn, small_model)

@@ -240,7 +240,9 @@ def calibrate(
     told.append(f"axes: {handedness(model, placed, roles, here, session.energy)}")
     fit = fit_alignment(model, placed, roles, here, session.energy, palate, midsagittal)
     told.extend(fit.sentences)
-    session = _whole_session(session, model, first, base, fit, palate, midsagittal, len(still))
+    more = f" and {len(recordings) - 1} more" if len(recordings) > 1 else ""
+    seen = f"{len(still)} frames of {first.source}{more}"
+    session = _whole_session(session, model, seen, base, fit, palate, midsagittal)
     session = parse_session(session_toml(session), session.source)  # what its user will have
 
     poses = tuple(_tracked(one, model, session) for one in recordings)
@@ -784,13 +786,13 @@ def _trace_in_its_unit(read: Any, told: list[str]) -> Palate:
 def _whole_session(
     session: Session,
     model: TongueModel,
-    recording: Recording,
+    seen: str,
     base: _Base,
     fit: Registration,
     palate: Palate | None,
     midsagittal: bool,
-    frames: int,
 ) -> Session:
+    """The session as it is written; seen: the frames that it was found on, in words."""
     rotation = _orthonormal(fit.rotation @ base.rotation)
     translation = fit.rotation @ base.translation_mm + fit.translation_mm
     bounded = f", below {palate.source}" if palate is not None else ""
@@ -798,12 +800,12 @@ def _whole_session(
         session,
         alignment=Alignment(
             rotation, translation, midsagittal,
-            f"{base.source}, then fitted to the model over {frames} frames of {recording.source}{bounded}",
+            f"{base.source}, then fitted to the model over {seen}{bounded}",
         ),
         palate=palate.transformed(fit.rotation, fit.translation_mm) if palate is not None else None,
         correspondences=dict(zip(fit.correspondences.roles, fit.vertices, strict=True)),
         speaker_weights=fit.speaker_weights,
-        speaker_source=f"joint estimate with the alignment over {frames} frames of {recording.source}",
+        speaker_source=f"joint estimate with the alignment over {seen}",
         model_fingerprint=model.fingerprint,
     )  # fmt: skip
 

@@ -191,33 +191,39 @@ def _palate_title(calibration: Calibration, palate: Palate) -> str:
 
 
 def draw_correspondences(calibration: Calibration, model: TongueModel) -> Figure:
-    """The mesh from the side, its mid-sagittal contour, and the coils' vertices with numbers."""
+    """The mesh from the side, and from above where coils sit beside the middle: contour, and the coils' vertices."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 7), layout="constrained")
-    panel = figure.subplots()
+    beside = not calibration.session.alignment.midsagittal
+    figure = Figure(figsize=(9, 11 if beside else 7), layout="constrained")
+    panels = figure.subplots(1 + beside, 1, squeeze=False)[:, 0]
     weights = calibration.session.speaker_weights
     assert weights is not None
     shape = model.vertices(weights, model.pose.mean)
-    panel.triplot(shape[:, 1], shape[:, 2], model.faces, color="0.85", linewidth=0.3)
     line = shape[midsagittal_vertices(model)]
-    panel.plot(line[:, 1], line[:, 2], color="black", linewidth=1)
     coils = np.concatenate([run[2].coils for run in calibration.poses])
-    for index, role in enumerate(calibration.roles):
-        vertex = calibration.session.correspondences[role]
-        colour = COLOURS[index % len(COLOURS)]
-        middle = np.nanmedian(coils[:, index], axis=0)
+    for panel, axes in zip(panels, ([1, 2], [1, 0])[: len(panels)], strict=True):
+        panel.triplot(*shape[:, axes].T, model.faces, color="0.85", linewidth=0.3)
+        panel.plot(*line[:, axes].T, color="black", linewidth=1)
+        for index, role in enumerate(calibration.roles):
+            vertex = calibration.session.correspondences[role]
+            colour = COLOURS[index % len(COLOURS)]
+            middle = np.nanmedian(coils[:, index], axis=0)[axes]
+            there = shape[vertex, axes]
+            label = f"{index + 1} {role}: vertex {vertex}"
+            panel.plot(*there, "o", color=colour, markersize=9, label=label)
+            panel.plot(*middle, "x", color=colour, markersize=8, markeredgewidth=2)
+            panel.annotate(
+                str(index + 1), tuple(there), xytext=(7, 7), textcoords="offset points", weight="bold"
+            )
         panel.plot(
-            *shape[vertex, 1:], "o", color=colour, markersize=9, label=f"{index + 1} {role}: vertex {vertex}"
+            [], [], "x", color="0.3", markersize=8, markeredgewidth=2, label="middle of a coil's samples"
         )
-        panel.plot(*middle[1:], "x", color=colour, markersize=8, markeredgewidth=2)
-        panel.annotate(
-            str(index + 1), tuple(shape[vertex, 1:]), xytext=(7, 7), textcoords="offset points", weight="bold"
-        )
-    panel.plot([], [], "x", color="0.3", markersize=8, markeredgewidth=2, label="middle of a coil's samples")
-    _side_view(panel)
-    panel.set_title("correspondences on this speaker's mesh, mean pose")
-    _legend_below(figure, panel, columns=2)
+        _side_view(panel)
+    if beside:
+        panels[1].set_ylabel("x (left), mm")
+    panels[0].set_title("correspondences on this speaker's mesh, mean pose")
+    _legend_below(figure, panels[0], columns=2)
     return figure
 
 
