@@ -133,7 +133,10 @@ def next_step(args: argparse.Namespace) -> str:
     """What to look at, and the command that uses the session."""
     import shlex
 
-    stated = {"--model": None if args.model == BUNDLED else args.model, "--rate": args.rate}
+    stated = {
+        "--model": None if args.model == BUNDLED else args.model,
+        "--rate": args.rate and f"{args.rate:g}",
+    }
     stated |= {"--unit": args.unit, "--layout": args.layout, "--session": args.output, "--out": "poses.csv"}
     flags = [word for flag, value in stated.items() if value is not None for word in (flag, str(value))]
     track = shlex.join(["tonguetrack", "track", args.recordings[0], *flags])
