@@ -77,8 +77,9 @@ class FrameBundle:
         self.datagram = bytearray(_bundle(messages))
         # One format for the whole datagram: what never changes is packed as bytes, between the numbers. After the
         # pause between two frames that takes a third of the time of writing through arrays.
-        layout, self._parts = ">", []
-        at, self._places = 0, []
+        layout, at = ">", 0
+        self._parts: list[bytes | float] = []
+        self._places: list[int] = []
         end = _BUNDLE_HEADER_BYTES
         for message, tags in zip(messages, self._number_tags(size), strict=True):
             end += _ELEMENT_HEADER_BYTES + len(message)

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 from ..pose import TrackedPose
@@ -111,7 +112,7 @@ class SlotSink:
             over = self._over
             if self._news and time.perf_counter() >= again_s:
                 info = self._news.popleft()
-                begun = self._try(lambda info=info: self._worker.begin(info))
+                begun = self._try(partial(self._worker.begin, info))
                 if not begun:
                     again_s = time.perf_counter() + AGAIN_S
                     if not self._news:
@@ -129,7 +130,7 @@ class SlotSink:
             pose = self._newest.popleft()
         except IndexError:
             return
-        if self._try(lambda: self._worker.work(pose)):
+        if self._try(partial(self._worker.work, pose)):
             self.sent += 1
             self.failure = ""
         else:
