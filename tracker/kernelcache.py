@@ -12,6 +12,7 @@ from pathlib import Path
 VARIABLE = "NUMBA_CACHE_DIR"
 KERNEL_MODULES = {
     "drivers.devices.rtc3d_decode": "RTC3D",
+    "model.mri.diffusion": "denoising of scans",
     "tracker.anatomy": "joint speaker",
     "tracker.filters": "live smoothing",
     "tracker.guard": "coil guard",
