@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import InputError, __version__
 from .mesh import FloatArray, IndexArray, Mesh, read_mesh
@@ -43,6 +44,19 @@ class TrainingShapes:
     filled: tuple[tuple[str, str], ...] = ()
     marks: SurfaceMarks = field(default_factory=SurfaceMarks)
     provenance: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(speakers, prompts): which cells are meshes, not averages."""
+        measured = np.ones(self.tensor.shape[:2], dtype=bool)
+        for speaker, prompt in self.filled:
+            measured[self.speakers.index(speaker), self.prompts.index(prompt)] = False
+        return measured
+
+    @property
+    def source(self) -> str:
+        """What to call these shapes in a message."""
+        return self.provenance.get("source", "the training shapes")
 
 
 def read_sample_database(path: str | Path) -> SampleDatabase:

@@ -84,6 +84,11 @@ def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
     return np.asarray(normals / np.where(length > 0, length, 1.0))
 
 
+def vertex_distances(shapes: FloatArray, truth: FloatArray) -> FloatArray:
+    """(T, V) mm between the corresponding vertices of shapes and truth, both (T, k)."""
+    return np.asarray(np.linalg.norm((shapes - truth).reshape(len(shapes), -1, 3), axis=2))
+
+
 def _first_line(reason: BaseException) -> str:
     lines = io.StringIO(str(reason)).readline().strip()
     return f"{type(reason).__name__}: {lines}"[:120]

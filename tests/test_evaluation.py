@@ -15,6 +15,8 @@ from tonguetrack.model.build import (
     model_from_shapes,
     read_sample_database,
 )
+from tonguetrack.model.completion import training_without
+from tonguetrack.model.mesh import vertex_distances
 from tonguetrack.model.multilinear import SurfaceMarks
 from tonguetrack.model.synthetic import PHONES, tongue_template
 from tonguetrack.model.synthetic.samples import training_shapes, write_samples
@@ -30,8 +32,6 @@ from tonguetrack.tracker.evaluation import (
     best_fit,
     evaluate,
     swept_fit,
-    training_without,
-    vertex_distances,
 )
 from tonguetrack.tracker.evaluationreport import REPORT_FILES
 

@@ -27,10 +27,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import InputError
-from ..model.build import TrainingShapes, fill_missing_by_averaging, model_from_shapes
+from ..model.build import TrainingShapes, model_from_shapes
+from ..model.completion import training_without
+from ..model.mesh import vertex_distances
 from ..model.multilinear import SurfaceMarks, TongueModel
 from .anatomy import SpeakerEstimator, estimate_speaker
 from .pose import FloatArray
@@ -258,7 +259,7 @@ def evaluate(
     Raises InputError where plan, regions and shapes contradict each other.
     """
     _check(shapes, plan, regions)
-    measured = _measured(shapes)
+    measured = shapes.measured
     areas: dict[str, Sequence[int]] = {WHOLE_MESH: range(shapes.tensor.shape[2] // 3), **regions}
     areas[COILS] = plan.coils
     errors = {name: np.full((*measured.shape, len(areas)), np.nan) for name in ESTIMATORS}
@@ -275,57 +276,13 @@ def evaluate(
         for left_out, rows in groups:
             training = training_without(shapes, speaker, left_out)
             model = model_from_shapes(training, plan.speaker_modes, plan.pose_modes)
-            pooled = training.tensor[_measured(training)]
+            pooled = training.tensor[training.measured]
             fold = Fold(model, pooled, plan.coils, coils, plan.noise_mm, truth)
             for name, estimator in ESTIMATORS.items():
                 distances = vertex_distances(estimator(fold)[rows], truth[rows])
                 for part, vertices in enumerate(areas.values()):
                     errors[name][speaker, phones[rows], part] = distances[:, list(vertices)].mean(axis=1)
     return Evaluation(plan, shapes.speakers, shapes.prompts, tuple(areas), errors)
-
-
-def training_without(shapes: TrainingShapes, speaker: int, phone: int | None) -> TrainingShapes:
-    """The shapes of all other speakers (and, unless None, of all other phones), their missing cells filled anew: an
-    average must know nothing of what is left out.
-
-    Raises InputError where nothing is left to fill a cell from.
-    """
-    others = [i for i in range(len(shapes.speakers)) if i != speaker]
-    phones = [j for j in range(len(shapes.prompts)) if j != phone]
-    tensor = shapes.tensor[np.ix_(others, phones)]
-    present = _measured(shapes)[np.ix_(others, phones)]
-    speakers = tuple(shapes.speakers[i] for i in others)
-    prompts = tuple(shapes.prompts[j] for j in phones)
-    lacking = [f"the speaker '{speakers[i]}'" for i in range(len(speakers)) if not present[i].any()]
-    lacking += [f"the phone '{prompts[j]}'" for j in range(len(prompts)) if not present[:, j].any()]
-    if lacking:
-        left_out = f"the speaker '{shapes.speakers[speaker]}'"
-        left_out += "" if phone is None else f" and the phone '{shapes.prompts[phone]}'"
-        raise InputError(
-            f"{_source(shapes)}: without {left_out} no mesh of {lacking[0]} is left; add one to the database, "
-            "or remove the entry."
-        )
-    tensor[~present] = np.nan
-    complete, missing = fill_missing_by_averaging(tensor)
-    filled = tuple((speakers[i], prompts[j]) for i, j in missing)
-    return replace(shapes, tensor=complete, speakers=speakers, prompts=prompts, filled=filled)
-
-
-def vertex_distances(shapes: FloatArray, truth: FloatArray) -> FloatArray:
-    """(T, V) mm between the corresponding vertices of shapes and truth, both (T, k)."""
-    return np.asarray(np.linalg.norm((shapes - truth).reshape(len(shapes), -1, 3), axis=2))
-
-
-def _measured(shapes: TrainingShapes) -> NDArray[np.bool_]:
-    """(speakers, prompts): which cells are meshes, not averages."""
-    measured = np.ones(shapes.tensor.shape[:2], dtype=bool)
-    for speaker, prompt in shapes.filled:
-        measured[shapes.speakers.index(speaker), shapes.prompts.index(prompt)] = False
-    return measured
-
-
-def _source(shapes: TrainingShapes) -> str:
-    return shapes.provenance.get("source", "the training shapes")
 
 
 def _check(shapes: TrainingShapes, plan: Plan, regions: Mapping[str, Sequence[int]]) -> None:
@@ -337,13 +294,13 @@ def _check(shapes: TrainingShapes, plan: Plan, regions: Mapping[str, Sequence[in
         for vertex in vertices:
             if not 0 <= vertex < count:
                 raise InputError(
-                    f"{where} names vertex {vertex}; the meshes of {_source(shapes)} have vertices 0 to {count - 1}."
+                    f"{where} names vertex {vertex}; the meshes of {shapes.source} have vertices 0 to {count - 1}."
                 )
     left = {"speaker": len(shapes.speakers) - 1, "phone": len(shapes.prompts) - plan.leave_phone_out}
     for what, rest in left.items():
         if rest < 1:
             raise InputError(
-                f"{_source(shapes)}: with one {what} left out nothing remains to build a model from; "
+                f"{shapes.source}: with one {what} left out nothing remains to build a model from; "
                 f"expected at least two {what}s."
             )
     for flag, wanted, what in (
