@@ -26,8 +26,8 @@ LEAST_GRADIENT = 1e-9
 def otsu(values: ArrayLike) -> float:
     """The threshold between dark and bright for which the variance between the two classes is largest (Otsu 1979).
 
-    Found on a histogram of 256 bins over the values' range; bright is what lies above it. Raises InputError where
-    all values are the same.
+    Found on a histogram of 256 bins over the values' range; bright is what lies above it. Raises InputError (without
+    the scan's name) where all values are the same.
     """
     flat = np.asarray(values).ravel()
     counts, edges = np.histogram(flat, BINS)
@@ -43,9 +43,12 @@ def otsu(values: ArrayLike) -> float:
     return float((edges[best[0] + 1] + edges[best[-1] + 1]) / 2.0)
 
 
-def partition(values: ArrayLike, threshold: float | None = None) -> NDArray[np.bool_]:
-    """(i, j, k) whether each voxel is tissue: above the threshold, by default Otsu's."""
-    return np.asarray(np.asarray(values) > (otsu(values) if threshold is None else threshold))
+def threshold_of(scan: Scan) -> float:
+    """Otsu's threshold of a denoised scan. Raises InputError where all voxels have the same value."""
+    try:
+        return otsu(scan.values)
+    except InputError as reason:
+        raise InputError(f"{scan.name}: {reason}") from reason
 
 
 def surface_points(scan: Scan, threshold: float | None = None) -> Cloud:
@@ -56,7 +59,8 @@ def surface_points(scan: Scan, threshold: float | None = None) -> Cloud:
     the gradient of the values, smoothed by 1 mm. Raises InputError where there is no surface at all.
     """
     values = scan.values
-    tissue = partition(values, threshold := otsu(values) if threshold is None else threshold)
+    level = threshold_of(scan) if threshold is None else threshold
+    tissue = values > level
     crossings = []
     for axis in range(3):
         before, behind = _neighbours(axis)
@@ -64,7 +68,7 @@ def surface_points(scan: Scan, threshold: float | None = None) -> Cloud:
         low = values[before][places].astype(np.float64)
         high = values[behind][places].astype(np.float64)
         voxels = np.stack(places, axis=1).astype(np.float64)
-        voxels[:, axis] += (threshold - low) / (high - low)
+        voxels[:, axis] += (level - low) / (high - low)
         crossings.append(voxels)
     return _cloud(np.concatenate(crossings), values, NORMAL_SIGMA_MM, scan)
 
@@ -75,7 +79,7 @@ def voxel_surface(scan: Scan, threshold: float | None = None) -> Cloud:
     Normals point out of the tissue and come from the partition, smoothed by 1.5 mm. Voxels at the border of the
     scan count as having more of the same beyond. Raises InputError where there is no surface at all.
     """
-    tissue = partition(scan.values, threshold)
+    tissue = scan.values > (threshold_of(scan) if threshold is None else threshold)
     surface = np.zeros_like(tissue)
     for axis in range(3):
         before, behind = _neighbours(axis)

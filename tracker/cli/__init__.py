@@ -27,6 +27,7 @@ def build_parser() -> argparse.ArgumentParser:
         live,
         model,
         monitor,
+        mri,
         simulate,
         take,
         track,
@@ -39,7 +40,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"tonguetrack {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for family in (
-        demo, live, track, calibrate, anatomy, files, take, devices, doctor, model, evaluate, experiment, simulate,
+        demo, live, track, calibrate, anatomy, files, take, devices, doctor, model, mri, evaluate, experiment, simulate,
         monitor, bench,
     ):  # fmt: skip
         family.add_commands(commands)

@@ -1,0 +1,13 @@
+"""tonguetrack mri ...: from MRI scans to a model, at once or step by step."""
+
+from __future__ import annotations
+
+import argparse
+
+from . import scansteps
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    family = commands.add_parser("mri", help="from MRI scans to a model, at once or step by step")
+    verbs = family.add_subparsers(dest="verb", metavar="VERB", required=True)
+    scansteps.add_verbs(verbs)
