@@ -13,6 +13,9 @@ VARIABLE = "NUMBA_CACHE_DIR"
 KERNEL_MODULES = {
     "drivers.devices.rtc3d_decode": "RTC3D",
     "model.mri.diffusion": "denoising of scans",
+    "model.mri.phantom.render": "phantom's volumes",
+    "model.mri.phantom.tissue": "phantom's anatomy",
+    "model.mri.phantom.tongue": "phantom's tongues",
     "tracker.anatomy": "joint speaker",
     "tracker.filters": "live smoothing",
     "tracker.guard": "coil guard",

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from . import scansteps
+from . import phantom, scansteps
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     family = commands.add_parser("mri", help="from MRI scans to a model, at once or step by step")
     verbs = family.add_subparsers(dest="verb", metavar="VERB", required=True)
     scansteps.add_verbs(verbs)
+    phantom.add_verbs(verbs)
