@@ -66,7 +66,7 @@ def _header(nibabel: Any, stream: BinaryIO) -> Any:
     start = stream.read(540)
     length = {int.from_bytes(start[:4], order) for order in ("little", "big")}
     kind, size = (nibabel.Nifti2Header, 540) if 540 in length else (nibabel.Nifti1Header, 348)
-    if not length & {348, 540} or len(start) < 540:
+    if not length & {348, 540} or len(start) < size:
         raise InputError("it does not begin with a NIfTI header, or is cut short.")
     header = kind(start[:size])
     offset = int(header["vox_offset"])

@@ -45,10 +45,11 @@ def checked_shape(sizes: Sequence[int]) -> tuple[int, int, int]:
 def take_values(stream: BinaryIO, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> NDArray[Any]:
     """The volume that begins where the stream stands, its first axis the fastest, as (i, j, k).
 
-    Never reads more than that. Raises InputError (without the file's name) where the stream ends before.
+    Never reads more than one byte beyond. Raises InputError (without the file's name) where the stream ends before.
     """
     expected = math.prod(shape) * dtype.itemsize
     content = stream.read(expected)
     if len(content) < expected:
         raise InputError(f"the file is cut short: {len(content)} of {expected} bytes of values are there.")
+    stream.read(1)  # behind the last value of a packed file, its checksum is compared
     return np.frombuffer(content, dtype).reshape(shape, order="F")
