@@ -30,7 +30,7 @@ def add_verbs(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> Non
         type=float,
         default=0.1,
         metavar="C",
-        help="gradient that is an edge, as a share of the grey range per mm (default 0.1)",
+        help="gradient that is an edge, as a share of that between black and white (default 0.1)",
     )
     denoise.add_argument(
         "--sigma", type=float, default=1.0, metavar="MM", help="smoothing before gradients (default 1)"
