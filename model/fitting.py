@@ -297,6 +297,11 @@ class _Box:
         return cls(mean, spread, mean - h * spread, mean + h * spread)
 
 
+def allowed_reach(mode: Mode, h: float) -> FloatArray:
+    """(w,) how far each weight may be from its mean in a box of h."""
+    return h * _spread(mode)
+
+
 def _spread(mode: Mode) -> FloatArray:
     """(w,) the deviation of the training weights, or sigma where the model does not keep them."""
     measured = mode.measured_sigma

@@ -31,6 +31,7 @@ import numpy as np
 from .. import InputError
 from ..model.build import TrainingShapes, model_from_shapes
 from ..model.completion import training_without
+from ..model.evaluation import WHOLE_MESH
 from ..model.mesh import vertex_distances
 from ..model.multilinear import SurfaceMarks, TongueModel
 from .anatomy import SpeakerEstimator, estimate_speaker
@@ -46,7 +47,7 @@ LEAST_POSTERIOR_NOISE_MM = (
     0.1  # what the posterior assumes of coils without noise, so that it stays determined
 )
 LARGEST_NOISE_MM = 100.0
-WHOLE_MESH, COILS = "whole mesh", "coils"
+COILS = "coils"
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 VARIABLE = "NUMBA_CACHE_DIR"
 KERNEL_MODULES = {
     "drivers.devices.rtc3d_decode": "RTC3D",
+    "model.nearest": "specificity",
     "model.mri.diffusion": "denoising of scans",
     "model.mri.phantom.render": "phantom's volumes",
     "model.mri.phantom.tissue": "phantom's anatomy",

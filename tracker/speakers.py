@@ -198,7 +198,7 @@ def mesh_speaker(model: TongueModel, meshes: Sequence[Mesh], h: float) -> Speake
             model, [Cloud(mesh.vertices, vertex_normals(mesh.vertices, mesh.faces)) for mesh in meshes], h
         )
         sigma = fit.sigma
-    _check_place(model, fit)
+    check_place(model, fit)
     kind = "registered mesh" if registered else "surface"
     plural = "" if len(meshes) == 1 else "es" if registered else "s"
     return SpeakerResult(
@@ -218,7 +218,8 @@ def _jackknife(model: TongueModel, vertices: FloatArray, h: float) -> FloatArray
     return np.asarray(error / model.speaker.sigma)
 
 
-def _check_place(model: TongueModel, fit: Fit) -> None:
+def check_place(model: TongueModel, fit: Fit) -> None:
+    """Raises InputError where what was fitted lies somewhere else than the model."""
     if fit.residual_mm.max() > FAR_MM:
         raise InputError(
             f"mesh {int(fit.residual_mm.argmax()) + 1}: its vertices stay {fit.residual_mm.max():.0f} mm away from the "

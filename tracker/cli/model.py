@@ -1,4 +1,4 @@
-"""tonguetrack model ...: build, look at and convert tongue models."""
+"""tonguetrack model ...: build, look at, convert, fit and evaluate tongue models."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import json
 import sys
 from typing import TYPE_CHECKING, Any
 
+from . import modelevaluate, modelfit
+
 if TYPE_CHECKING:
     from ...model.multilinear import Mode, TongueModel
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    family = commands.add_parser("model", help="build, look at and convert tongue models")
+    family = commands.add_parser("model", help="build, look at, convert, fit and evaluate tongue models")
     verbs = family.add_subparsers(dest="verb", metavar="VERB", required=True)
 
     build = verbs.add_parser("build", help="a model from a sample database of registered meshes")
@@ -48,6 +50,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     synthetic.add_argument("folder", metavar="FOLDER", help="an absent or empty folder")
     synthetic.set_defaults(run=run_synthetic)
+
+    modelfit.add_verb(verbs)
+    modelevaluate.add_verb(verbs)
 
 
 def run_build(args: argparse.Namespace) -> int:
