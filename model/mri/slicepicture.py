@@ -66,7 +66,7 @@ def slice_png(scan: Scan, plane: str, at_mm: float, cloud: Cloud | None = None) 
     axes = figure.add_subplot()
     axes.imshow(values, cmap="gray", origin="lower", extent=edges, interpolation="nearest")
     if cloud is not None:
-        near = np.abs(cloud.points[:, across] - at_mm) <= scan.spacing_mm.min() / 2
+        near = np.abs(cloud.points[:, across] - at_mm) <= 0.51 * scan.spacing_mm.max()
         points = cloud.points[near][:, [right, up]]
         if cloud.normals is not None:
             ends = points + TICK_MM * cloud.normals[near][:, [right, up]]

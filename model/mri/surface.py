@@ -16,10 +16,10 @@ from ..mesh import FloatArray
 from .scan import Scan
 
 BINS = 256
-# How far what the normals follow is smoothed. Both were chosen on noisy spheres and oblique planes, where less
-# follows the noise and the grid, and more rounds off what is there.
-NORMAL_SIGMA_MM = 1.0
-PARTITION_SIGMA_MM = 1.5
+# How far what the normals follow is smoothed, in units of the largest distance between voxels. Both were chosen on
+# noisy balls and oblique planes, where less follows the noise and the grid, and more rounds off what is there.
+NORMAL_SIGMA = 1.0
+PARTITION_SIGMA = 1.25
 LEAST_GRADIENT = 1e-9
 
 
@@ -56,7 +56,7 @@ def surface_points(scan: Scan, threshold: float | None = None) -> Cloud:
 
     One point on every line between two neighbouring voxels that the surface crosses: where the values, linear in
     between, equal the threshold (by default Otsu's). About twice as many as `voxel_surface` gives. Normals follow
-    the gradient of the values, smoothed by 1 mm. Raises InputError where there is no surface at all.
+    the gradient of the values, smoothed by a voxel. Raises InputError where there is no surface at all.
     """
     values = scan.values
     level = threshold_of(scan) if threshold is None else threshold
@@ -70,14 +70,14 @@ def surface_points(scan: Scan, threshold: float | None = None) -> Cloud:
         voxels = np.stack(places, axis=1).astype(np.float64)
         voxels[:, axis] += (level - low) / (high - low)
         crossings.append(voxels)
-    return _cloud(np.concatenate(crossings), values, NORMAL_SIGMA_MM, scan)
+    return _cloud(np.concatenate(crossings), values, NORMAL_SIGMA, scan)
 
 
 def voxel_surface(scan: Scan, threshold: float | None = None) -> Cloud:
     """The paper's surface of the tissue in a denoised scan, mm: the tissue voxels with a neighbour that is none.
 
-    Normals point out of the tissue and come from the partition, smoothed by 1.5 mm. Voxels at the border of the
-    scan count as having more of the same beyond. Raises InputError where there is no surface at all.
+    Normals point out of the tissue and come from the partition, smoothed by a little more than a voxel. Voxels at the
+    border of the scan count as having more of the same beyond. Raises InputError where there is no surface at all.
     """
     tissue = scan.values > (threshold_of(scan) if threshold is None else threshold)
     surface = np.zeros_like(tissue)
@@ -87,7 +87,7 @@ def voxel_surface(scan: Scan, threshold: float | None = None) -> Cloud:
         surface[before] |= differ
         surface[behind] |= differ
     voxels = np.argwhere(surface & tissue).astype(np.float64)
-    return _cloud(voxels, tissue, PARTITION_SIGMA_MM, scan)
+    return _cloud(voxels, tissue, PARTITION_SIGMA, scan)
 
 
 def _neighbours(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
@@ -98,15 +98,16 @@ def _neighbours(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
     return tuple(before), tuple(behind)
 
 
-def _cloud(voxels: FloatArray, brightness: NDArray[np.generic], sigma_mm: float, scan: Scan) -> Cloud:
+def _cloud(voxels: FloatArray, brightness: NDArray[np.generic], sigma: float, scan: Scan) -> Cloud:
     """The cloud of points at voxel indices (n, 3), with normals down the smoothed gradient of the brightness."""
     from scipy.ndimage import gaussian_filter, map_coordinates
 
     volume = brightness.astype(np.float32)
+    widths = sigma * scan.spacing_mm.max() / scan.spacing_mm
     gradients = []
     for axis, distance in enumerate(scan.spacing_mm):
         order = [int(axis == other) for other in range(3)]
-        slope = gaussian_filter(volume, sigma_mm / scan.spacing_mm, order=order, mode="nearest")
+        slope = gaussian_filter(volume, widths, order=order, mode="nearest")
         gradients.append(map_coordinates(slope, voxels.T, order=1, mode="nearest") / distance)
     gradient = np.stack(gradients, axis=1).astype(np.float64)
     steepness = np.linalg.norm(gradient, axis=1)
