@@ -174,7 +174,7 @@ def _plan(along: FloatArray, arch: FloatArray) -> FloatArray:
     x = np.arange(0.0, PLAN_SIDE_MM + STEP_MM / 2, STEP_MM)
     y = np.arange(PLAN_FRONT_MM, TABLE_END_MM + STEP_MM / 2, STEP_MM)
     places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    distance = cKDTree(line).query(places.reshape(-1, 2))[0].reshape(len(x), len(y))
+    distance = np.asarray(cKDTree(line).query(places.reshape(-1, 2))[0]).reshape(len(x), len(y))
     inside = (places[..., 1] > ROOF_START_MM) & (places[..., 0] < np.interp(places[..., 1], along, arch))
     return np.where(inside, -distance, distance)
 

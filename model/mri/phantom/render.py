@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .anatomy import Head
-from .tissue import SIGNALS, Pose, label_at
+from .tissue import SIGNALS, Pose, label_grid, mean_signal
 
 FloatArray = NDArray[np.float64]
 
-FINER = 3  # sub-voxels a direction where a voxel may hold two tissues
-SEEN = 0.12  # a smaller step in signal needs no finer look
 WHITE = 900.0  # scanner's units of a signal of 1
 
 
@@ -37,8 +34,8 @@ def labels_and_signal(
 
     to_head: (3, 4) voxel index -> place in the head frame at reference size.
     """
-    labels = _label_centres(shape, to_head, head, pose)
-    return labels, _mean_signal(labels, to_head, head, pose, SIGNALS)
+    labels = label_grid(shape, to_head, head, pose)
+    return labels, mean_signal(labels, to_head, head, pose, SIGNALS)
 
 
 def acquired(
@@ -90,61 +87,3 @@ def _waves(
             direction[0] * places[0] + direction[1] * places[1] + direction[2] * places[2] + phase
         )
     return total * np.sqrt(2.0 / count)
-
-
-@njit(cache=True)
-def _label_centres(
-    shape: tuple[int, int, int], to_head: FloatArray, head: Head, pose: Pose
-) -> NDArray[np.uint8]:
-    labels = np.empty(shape, dtype=np.uint8)
-    for i in range(shape[0]):
-        for j in range(shape[1]):
-            for k in range(shape[2]):
-                labels[i, j, k] = _label_there(i, j, k, to_head, head, pose)
-    return labels
-
-
-@njit(cache=True)
-def _label_there(i: float, j: float, k: float, to_head: FloatArray, head: Head, pose: Pose) -> int:
-    x = to_head[0, 0] * i + to_head[0, 1] * j + to_head[0, 2] * k + to_head[0, 3]
-    y = to_head[1, 0] * i + to_head[1, 1] * j + to_head[1, 2] * k + to_head[1, 3]
-    z = to_head[2, 0] * i + to_head[2, 1] * j + to_head[2, 2] * k + to_head[2, 3]
-    return label_at(x, y, z, head, pose)
-
-
-@njit(cache=True)
-def _mean_signal(
-    labels: NDArray[np.uint8], to_head: FloatArray, head: Head, pose: Pose, signals: FloatArray
-) -> FloatArray:
-    """Only voxels with a neighbour of clearly another signal are looked at more finely."""
-    n, m, o = labels.shape
-    signal = np.empty(labels.shape)
-    for i in range(n):
-        for j in range(m):
-            for k in range(o):
-                own = labels[i, j, k]
-                mixed = False
-                for a, b, c in ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)):
-                    other = labels[
-                        min(max(i + a, 0), n - 1), min(max(j + b, 0), m - 1), min(max(k + c, 0), o - 1)
-                    ]
-                    if abs(signals[other] - signals[own]) > SEEN:
-                        mixed = True
-                if not mixed:
-                    signal[i, j, k] = signals[own]
-                    continue
-                total = 0.0
-                for a in range(FINER):
-                    for b in range(FINER):
-                        for c in range(FINER):
-                            label = _label_there(
-                                i + (a + 0.5) / FINER - 0.5,
-                                j + (b + 0.5) / FINER - 0.5,
-                                k + (c + 0.5) / FINER - 0.5,
-                                to_head,
-                                head,
-                                pose,
-                            )
-                            total += signals[label]
-                signal[i, j, k] = total / FINER**3
-    return signal

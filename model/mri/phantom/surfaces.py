@@ -60,14 +60,14 @@ def tongue_surface(tongue: Tongue, head: Head) -> TongueSurface:
     faces = _grid_faces(*radius.shape)
     kind = np.zeros(radius.shape, dtype=np.uint8)
     kind[:, SIDE_ROWS:-SIDE_ROWS][touching] = CONTACT
-    kind = kind.ravel()
+    kinds = kind.ravel()
     normals = vertex_normals(vertices, faces)
-    for vertex in np.flatnonzero(kind != CONTACT):
+    for vertex in np.flatnonzero(kinds != CONTACT):
         looked = (vertices[vertex] + far * normals[vertex] for far in LOOK_MM)
-        if not any(label_at(*place, head, pose) in DARK for place in looked):
-            kind[vertex] = BURIED
+        if not any(label_at(x, y, z, head, pose) in DARK for x, y, z in looked):
+            kinds[vertex] = BURIED
     grid = np.arange(radius.size).reshape(radius.shape)
-    return TongueSurface(Mesh(vertices, faces), kind, grid[:, SIDE_ROWS + TOP_COLUMNS // 2])
+    return TongueSurface(Mesh(vertices, faces), kinds, grid[:, SIDE_ROWS + TOP_COLUMNS // 2])
 
 
 def palate_surface(head: Head) -> Mesh:

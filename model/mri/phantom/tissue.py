@@ -2,6 +2,9 @@
 
 All kernels take places in the head frame at reference size (mm; see `anatomy`). Order decides: skin, teeth and
 bone first, then tongue, soft palate and epiglottis, then what is left of the cavities, and muscle for the rest.
+
+All kernels of the phantom are here: numba keeps a compiled function as long as its own file is unchanged, whatever
+became of a function in another file that it calls.
 """
 
 from __future__ import annotations
@@ -37,6 +40,10 @@ FREE, PALATE, VELUM, TEETH, WALL = range(5)
 DEGREE_STEP = 1.0  # of the tables around the pole line
 GUM_MM = 4.5  # the upper gum's edge over the biting plane, at the molars
 HINGE_Y, HINGE_Z = HINGE
+LONGEST_MM = 75.0
+RAY_STEP_MM = 1.5
+FINER = 3  # sub-voxels a direction where a voxel may hold two tissues
+SEEN = 0.12  # a smaller step in signal needs no finer look
 
 
 class Pose(NamedTuple):
@@ -317,11 +324,8 @@ def _in_epiglottis(x: float, y: float, z: float, top_y: float) -> bool:
 def _upper_jaw_side(z: float, outside: float, y: float, deep_below_skin: float) -> int:
     """Gum, the bone that holds the teeth, and cheek or lip beside them."""
     deep = 9.5 - 3.0 * min(max(1.0 - y / 14.0, 0.0), 1.0)
-    if outside < deep - 0.3 and z > GUM_MM:
-        if outside < 1.5:
-            return MUCOSA
-        if z < 19.0:
-            return BONE
+    if outside < deep - 0.3 and GUM_MM < z < 19.0:
+        return MUCOSA if outside < 1.5 else BONE
     return FAT if 2.0 < deep_below_skin < 6.0 else MUSCLE
 
 
@@ -367,8 +371,8 @@ def _in_mouth(
     if z > 0.0:
         return outside < 0.0  # what lies above the roof was told before
     floor = pose.base_z + (4.5 if abs(x) > 6.0 else 0.0)
-    if z < floor:
-        return False
+    if z < floor or (z < pose.pole_z + 2.0 and y > pose.pole_y - 14.0):
+        return False  # below the tongue's own base there is its root, never air
     if jaw_z > 0.0:  # between the rows of teeth, where the cheek leans in
         return outside < (3.5 if y > 14.0 else 6.0)
     return lower < 0.0
@@ -419,3 +423,96 @@ def _soft_rest(
     if abs(x) > 22.0 and -40.0 < z < 0.0:
         return FAT
     return MUSCLE
+
+
+@njit(cache=True)
+def ray_limits(angles: FloatArray, head: Head, pose: Pose) -> tuple[FloatArray, NDArray[np.int8]]:
+    """Where rays from the pole line run into something, and into what: (rows, across) mm and code, for every angle
+    (rows,) in degrees and every column of the pose's tables, of which only the width is read."""
+    rows, columns = len(angles), pose.radius.shape[1]
+    limit = np.full((rows, columns), LONGEST_MM)
+    stop = np.zeros((rows, columns), dtype=np.int8)
+    for row in range(rows):
+        turned = np.radians(angles[row])
+        front, up = -np.cos(turned), np.sin(turned)
+        for column in range(columns):
+            x = pose.width[row] * (2.0 * column / (columns - 1) - 1.0)
+            radius = 12.0
+            while radius < LONGEST_MM:
+                found = what_stops_the_tongue(
+                    x, pose.pole_y + radius * front, pose.pole_z + radius * up, head, pose
+                )
+                if found != FREE:
+                    free, blocked = radius - RAY_STEP_MM, radius
+                    for _ in range(8):
+                        half = 0.5 * (free + blocked)
+                        there = what_stops_the_tongue(
+                            x, pose.pole_y + half * front, pose.pole_z + half * up, head, pose
+                        )
+                        if there == FREE:
+                            free = half
+                        else:
+                            blocked = half
+                            found = there
+                    limit[row, column] = free
+                    stop[row, column] = found
+                    break
+                radius += RAY_STEP_MM
+    return limit, stop
+
+
+@njit(cache=True)
+def label_grid(shape: tuple[int, int, int], to_head: FloatArray, head: Head, pose: Pose) -> NDArray[np.uint8]:
+    """The label at every voxel's centre. to_head: (3, 4) voxel index -> place."""
+    labels = np.empty(shape, dtype=np.uint8)
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            for k in range(shape[2]):
+                labels[i, j, k] = _label_there(i, j, k, to_head, head, pose)
+    return labels
+
+
+@njit(cache=True)
+def _label_there(i: float, j: float, k: float, to_head: FloatArray, head: Head, pose: Pose) -> int:
+    x = to_head[0, 0] * i + to_head[0, 1] * j + to_head[0, 2] * k + to_head[0, 3]
+    y = to_head[1, 0] * i + to_head[1, 1] * j + to_head[1, 2] * k + to_head[1, 3]
+    z = to_head[2, 0] * i + to_head[2, 1] * j + to_head[2, 2] * k + to_head[2, 3]
+    return label_at(x, y, z, head, pose)
+
+
+@njit(cache=True)
+def mean_signal(
+    labels: NDArray[np.uint8], to_head: FloatArray, head: Head, pose: Pose, signals: FloatArray
+) -> FloatArray:
+    """The mean signal over every voxel, of labels at their centres; signals: of each label. Only voxels with a neighbour of clearly another signal are looked at more finely."""
+    n, m, o = labels.shape
+    signal = np.empty(labels.shape)
+    for i in range(n):
+        for j in range(m):
+            for k in range(o):
+                own = labels[i, j, k]
+                mixed = False
+                for a, b, c in ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)):
+                    other = labels[
+                        min(max(i + a, 0), n - 1), min(max(j + b, 0), m - 1), min(max(k + c, 0), o - 1)
+                    ]
+                    if abs(signals[other] - signals[own]) > SEEN:
+                        mixed = True
+                if not mixed:
+                    signal[i, j, k] = signals[own]
+                    continue
+                total = 0.0
+                for a in range(FINER):
+                    for b in range(FINER):
+                        for c in range(FINER):
+                            label = _label_there(
+                                i + (a + 0.5) / FINER - 0.5,
+                                j + (b + 0.5) / FINER - 0.5,
+                                k + (c + 0.5) / FINER - 0.5,
+                                to_head,
+                                head,
+                                pose,
+                            )
+                            total += signals[label]
+                signal[i, j, k] = total / FINER**3
+    return signal

@@ -10,14 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .anatomy import STEP_MM, Anatomy, Head, head_of
 from .articulation import Articulation, articulation_of
 from .tissue import (
     DEGREE_STEP,
-    FREE,
     PALATE,
     TEETH,
     VELUM,
@@ -27,15 +25,13 @@ from .tissue import (
     from_jaw_frame,
     in_jaw_frame,
     lookup,
-    what_stops_the_tongue,
+    ray_limits,
 )
 
 FloatArray = NDArray[np.float64]
 
 REFERENCE = Anatomy("reference")
 ACROSS = 73  # columns of the radius table
-LONGEST_MM = 75.0
-RAY_STEP_MM = 1.5
 POLE = (34.0, -28.0)
 FLOOR = (11.0, -19.0)  # where the tongue meets the floor of the mouth behind the incisors, jaw closed
 # From the tip along the middle, mm: half width of the tongue, and how deep its rounded top is.
@@ -105,7 +101,8 @@ def _prepared(anatomy: Anatomy, head: Head, articulation: Articulation) -> _Part
     rest = _turn(articulation_of("ə").jaw_deg * anatomy.jaw)
     pole_place = np.array([POLE[0] * anatomy.mouth, -9.0 + (POLE[1] + 9.0) * anatomy.pharynx])
     # The pole goes half of the way with the jaw: the hyoid follows it.
-    moved = np.array(from_jaw_frame(*in_jaw_frame(*pole_place, rest), jaw))
+    closed_y, closed_z = in_jaw_frame(pole_place[0], pole_place[1], rest)
+    moved = np.array(from_jaw_frame(closed_y, closed_z, jaw))
     pole = 0.5 * (pole_place + moved)
     base = np.array(from_jaw_frame(*FLOOR, jaw))
     under = 0.45 * base + 0.55 * contour[0] + [1.2, -1.0]
@@ -136,7 +133,7 @@ def _prepared(anatomy: Anatomy, head: Head, articulation: Articulation) -> _Part
         articulation.protrusion_mm,
         _velum(anatomy, head, articulation),
     )
-    limit, stop = _ray_limits(angles, head, pose)
+    limit, stop = ray_limits(angles, head, pose)
     return _Parts(pose, angles, radius, beyond_tip, top_depth, limit, stop, base)
 
 
@@ -230,41 +227,6 @@ def _velum(anatomy: Anatomy, head: Head, articulation: Articulation) -> FloatArr
             [66.0 + shift, start - 15.0 + 0.5 * lift, 0.55 * half, 3.5],
         ]
     )
-
-
-@njit(cache=True)
-def _ray_limits(angles: FloatArray, head: Head, pose: Pose) -> tuple[FloatArray, NDArray[np.int8]]:
-    """Where rays from the pole line run into something, and into what."""
-    rows = len(angles)
-    limit = np.full((rows, ACROSS), LONGEST_MM)
-    stop = np.zeros((rows, ACROSS), dtype=np.int8)
-    for row in range(rows):
-        turned = np.radians(angles[row])
-        front, up = -np.cos(turned), np.sin(turned)
-        for column in range(ACROSS):
-            x = pose.width[row] * (2.0 * column / (ACROSS - 1) - 1.0)
-            radius = 12.0
-            while radius < LONGEST_MM:
-                found = what_stops_the_tongue(
-                    x, pose.pole_y + radius * front, pose.pole_z + radius * up, head, pose
-                )
-                if found != FREE:
-                    free, blocked = radius - RAY_STEP_MM, radius
-                    for _ in range(8):
-                        half = 0.5 * (free + blocked)
-                        there = what_stops_the_tongue(
-                            x, pose.pole_y + half * front, pose.pole_z + half * up, head, pose
-                        )
-                        if there == FREE:
-                            free = half
-                        else:
-                            blocked = half
-                            found = there
-                    limit[row, column] = free
-                    stop[row, column] = found
-                    break
-                radius += RAY_STEP_MM
-    return limit, stop
 
 
 def _smoothed(values: FloatArray, width: int) -> FloatArray:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ class ScanTruth:
 def write_truth(truth: ScanTruth, path: Path) -> None:
     """Writes the truth as .npz; single precision for vertices (10 nm)."""
 
-    def write(stream: io.BufferedIOBase) -> None:
+    def write(stream: BinaryIO) -> None:
         np.savez_compressed(
             stream,
             tongue_vertices=truth.tongue.vertices.astype(np.float32),
