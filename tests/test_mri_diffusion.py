@@ -18,6 +18,7 @@ from tonguetrack.model.mri.diffusion import (
     _repeat_edges,
     denoise,
     largest_stable_step_mm2,
+    steepest_edge,
 )
 
 SPACING = (1.1875, 1.1875, 1.2)
@@ -185,6 +186,17 @@ def test_where_no_direction_is_singled_out_none_is_invented(matrix):
     assert value == pytest.approx(np.linalg.eigvalsh(matrix)[2])
     ambiguous = np.ptp(np.linalg.eigvalsh(matrix)[1:]) < 1e-9
     assert np.linalg.norm(vector) == pytest.approx(0.0 if ambiguous else 1.0)
+
+
+@pytest.mark.parametrize(("sigma_mm", "rho_mm"), [(1.0, 1.0), (1.0, 0.0), (2.0, 1.5)])
+def test_contrast_is_measured_against_a_sharp_edge_from_black_to_white(sigma_mm, rho_mm):
+    from scipy.ndimage import gaussian_filter1d
+
+    fine = 0.02
+    edge = np.where(np.arange(2000) < 1000, 255.0, 0.0)
+    slope = np.gradient(gaussian_filter1d(edge, sigma_mm / fine), fine)
+    measured = np.sqrt(gaussian_filter1d(slope**2, rho_mm / fine).max() if rho_mm else (slope**2).max())
+    assert steepest_edge(sigma_mm, rho_mm) == pytest.approx(measured, rel=1e-3)
 
 
 def test_across_an_edge_the_diffusivity_is_weickerts_and_along_it_one():

@@ -74,7 +74,8 @@ def read_cloud(path: str | Path) -> Cloud:
 
 def _vertices(header: str, path: Path) -> tuple[str, int, list[tuple[str, str]]]:
     """Order of bytes ('' for text), number of vertices, (name, type) of each of their properties."""
-    order, count, properties = "", 0, []
+    order, count = "", 0
+    properties: list[tuple[str, str]] = []
     element = None
     for words in (line.split() for line in header.splitlines()):
         if words[:1] == ["format"]:

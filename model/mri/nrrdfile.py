@@ -68,7 +68,8 @@ def _header_lines(start: bytes) -> tuple[list[str], int]:
     """The header's lines, and where the values begin: behind the first blank line, 0 where there is none."""
     if not start.startswith(b"NRRD"):
         raise InputError("it does not begin with a NRRD header.")
-    lines, at = [], 0
+    lines: list[str] = []
+    at = 0
     while at < len(start):
         end = start.find(b"\n", at)
         end = len(start) if end < 0 else end

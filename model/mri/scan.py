@@ -6,8 +6,10 @@ grid itself stays as it was stored, in whatever order and direction its axes run
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,7 +85,7 @@ class Scan:
                 f"scan's {' x '.join(map(str, self.values.shape))} voxels, or less than two voxels wide."
             )
         start, end = low.astype(int), high.astype(int)
-        part = self.values[tuple(slice(a, b) for a, b in zip(start, end, strict=True))]
+        part: NDArray[Any] = self.values[tuple(slice(a, b) for a, b in zip(start, end, strict=True))]
         moved = self.to_world.copy()
         moved[:3, 3] = self.points(start[None])[0]
         return Scan(np.ascontiguousarray(part), self.spacing_mm, moved, self.name)
@@ -145,6 +147,7 @@ def read_scan(path: str | Path) -> Scan:
     name = path.name.lower()
     if not path.exists():
         raise InputError(f"{path}: there is no such scan.")
+    reader: Callable[[Path], tuple[NDArray[Any], FloatArray]]
     if path.is_dir():
         reader = read_dicom_series
     elif name.endswith(niftifile.SUFFIXES):

@@ -14,10 +14,10 @@ from scipy.ndimage import gaussian_filter
 
 from tonguetrack.model.mri.diffusion import (
     FLUX_CONSTANT,
-    GREY_RANGE,
     TRUNCATE,
     denoise,
     largest_stable_step_mm2,
+    steepest_edge,
 )
 
 SPACING = np.array([1.1875, 1.1875, 1.2])
@@ -38,7 +38,7 @@ def some_scan(shape: tuple[int, int, int]) -> np.ndarray:
 def plain(values: np.ndarray, steps: int) -> np.ndarray:
     """The module's docstring, in whole arrays."""
     u = values.astype(np.float32)
-    squared_contrast = (CONTRAST * GREY_RANGE / (np.sqrt(2 * np.pi) * SIGMA_MM)) ** 2
+    squared_contrast = (CONTRAST * steepest_edge(SIGMA_MM, RHO_MM)) ** 2
     for _ in range(steps):
         smooth = gaussian_filter(
             u, SIGMA_MM / SPACING, radius=[int(np.ceil(TRUNCATE * SIGMA_MM / h)) for h in SPACING]
