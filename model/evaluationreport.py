@@ -15,7 +15,16 @@ import numpy as np
 from .. import InputError, __version__
 from ..atomic import write_atomically
 from .curves import Curve
-from .evaluation import COMPACTNESS, GENERALISATION, MODES, PHONES, SPECIFICITY, Evaluation
+from .evaluation import (
+    COMPACTNESS,
+    GENERALISATION,
+    MODES,
+    PHONES,
+    SPECIFICITY,
+    SPEECH,
+    UNIONS,
+    Evaluation,
+)
 from .generalisation import SPEAKER
 
 if TYPE_CHECKING:
@@ -78,7 +87,7 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
         "program": f"tonguetrack {__version__}",
         "samples": shapes.source,
         "speakers": list(shapes.speakers),
-        "phones": list(shapes.prompts),
+        "prompts": list(shapes.prompts),
         "filled_cells": [list(cell) for cell in shapes.filled],
         "settings": {
             "speaker_modes": settings.speaker_modes,
@@ -176,10 +185,10 @@ def draw_measures(evaluation: Evaluation) -> Figure:
             if title == COMPACTNESS:
                 panel.plot(np.arange(1, len(found[mode]) + 1), found[mode], ".-", color=MEAN)
                 panel.yaxis.set_major_formatter(PercentFormatter(1.0))
-                panel.set_ylabel("share of the variance")
+                panel.set_ylabel("share of the variance", size=9)
             else:
                 _draw_curve(panel, found[mode])
-                panel.set_ylabel("mean vertex distance, mm")
+                panel.set_ylabel("mean vertex distance, mm", size=9)
             _number_components(panel, mode, len(evaluation.shapes.prompts))
             if row == 0:
                 panel.set_title(title, size=10)
@@ -203,11 +212,13 @@ def draw_phones(evaluation: Evaluation) -> Figure:
     for index, (prompt, curve) in enumerate(evaluation.phones.items()):
         panel = panels[index]
         _draw_curve(panel, curve)
-        panel.set_title(f"[{prompt}]  {evaluation.regions[prompt]}", size=9)
+        region = evaluation.regions[prompt]
+        parts = region if region == SPEECH else " + ".join(UNIONS.get(region, (region,)))
+        panel.set_title(f"[{prompt}]  {parts}", size=9)
         # Labels at the outer edge only, where nothing is below.
         _number_components(panel, SPEAKER if index + columns >= count else None, len(curve.counts))
         if index % columns == 0:
-            panel.set_ylabel("mm")
+            panel.set_ylabel("mm", size=9)
     panels[0].set_ylim(bottom=0.0)
     figure.suptitle(f"Specificity of single phones. {_title(evaluation)}", size=9)
     return figure
