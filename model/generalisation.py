@@ -9,8 +9,8 @@ The fit is the one by which the authors' program measures, so that figures can b
     E(s, p) = 1/V sum_v |v(s, p) - q_v|^2,    |w - mean| <= h / sqrt(entries) for every weight w
 
 descended by L-BFGS-B (5 corrections, relative decrease 1e7 machine epsilons, projected slope 1e-5) from the mean weights.
-E is not convex, and this descent ends in a local minimum. `fitting.fit_shapes`, which looks further, comes lower by up
-to 5 %, and its bounds are the training weights' own deviations; its figures would flatter a model beside published ones.
+E is not convex, and this descent ends in a local minimum. `fitting.fit_shapes` looks further and comes lower, and its bounds
+are the training weights' own deviations; its figures would flatter a model beside published ones.
 
 All truncations of one model share one Gram matrix, of which each takes a block; no descent sees a vertex.
 """

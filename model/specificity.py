@@ -59,11 +59,14 @@ class Row:
 
     def errors(self, random: np.random.Generator, count: int) -> Float32Array:
         """(count,) mm, of so many samples."""
+        return self.nearest.errors(*self.shapes(random, count))
+
+    def shapes(self, random: np.random.Generator, count: int) -> tuple[Float32Array, Float32Array]:
+        """(count, 3, V) and (count, 3, g) mm: so many samples, and their means over the groups."""
         speaker, pose = (draw.sample(random, count) for draw in self.draws)
         products = (speaker[:, :, None] * pose[:, None, :]).reshape(count, -1).astype(np.float32)
         shapes = (products @ self.core).reshape(count, 3, -1)
-        group_means = (products @ self.group_core).reshape(count, 3, -1)
-        return self.nearest.errors(shapes, group_means)
+        return shapes, (products @ self.group_core).reshape(count, 3, -1)
 
 
 def specificity(
@@ -81,7 +84,15 @@ def specificity(
     region: the vertices. Cells that were filled are no real meshes and not compared with. Raises InputError for a region
     without vertices or with others than the meshes', for no samples, and where the mode that is held has fewer entries.
     """
-    model = _whole_model(shapes, region, samples, held, (POSE, SPEAKER)[mode == POSE])
+    rows = specificity_rows(shapes, mode, held, region, seed)
+    return _sampled(rows, samples, jobs, progress, f"specificity, {mode} mode")
+
+
+def specificity_rows(
+    shapes: TrainingShapes, mode: str, held: int, region: Sequence[int], seed: int = 1
+) -> list[Row]:
+    """What `specificity` draws from, a row for each number of components."""
+    model = _whole_model(shapes, region, held, (POSE, SPEAKER)[mode == POSE])
     meshes = _at(shapes.tensor[shapes.measured] - model.origin, region)
     nearest = NearestMesh.among(meshes, _at(model.origin, region))
     sizes: list[tuple[int, int]] = (
@@ -93,7 +104,7 @@ def specificity(
     for m, n in sizes:
         draws = _draw(model.speaker, m), _draw(model.pose, n)
         rows.append(_row(draws, _at(model.core[:m, :n], region), nearest, (seed, int(mode == POSE), m, n)))
-    return _sampled(rows, samples, jobs, progress, f"specificity, {mode} mode")
+    return rows
 
 
 def phone_specificity(
@@ -113,7 +124,7 @@ def phone_specificity(
     if prompt not in shapes.prompts:
         raise InputError(f"there is no phone '{prompt}'; {shapes.source} has {', '.join(shapes.prompts)}.")
     phone = shapes.prompts.index(prompt)
-    model = _whole_model(shapes, region, samples, held, POSE)
+    model = _whole_model(shapes, region, held, POSE)
     meshes = _at(shapes.tensor[shapes.measured[:, phone], phone] - model.origin, region)
     nearest = NearestMesh.among(meshes, _at(model.origin, region))
     assert model.pose.training is not None
@@ -142,12 +153,8 @@ def check_region(shapes: TrainingShapes, region: Sequence[int]) -> None:
 # Rows -------------------------------------------------------------------------------------------------
 
 
-def _whole_model(
-    shapes: TrainingShapes, region: Sequence[int], samples: int, held: int, held_mode: str
-) -> TongueModel:
+def _whole_model(shapes: TrainingShapes, region: Sequence[int], held: int, held_mode: str) -> TongueModel:
     check_region(shapes, region)
-    if samples < 1:
-        raise InputError(f"specificity of {samples} samples says nothing; expected 1 or more.")
     most = dict(zip((SPEAKER, POSE), shapes.tensor.shape, strict=False))[held_mode]
     if not 1 <= held <= most:
         raise InputError(f"specificity holds {held} {held_mode} components; expected 1 to {most}.")
@@ -181,6 +188,8 @@ def _row(draws: tuple[Draw, Draw], core: FloatArray, nearest: NearestMesh, seed:
 
 
 def _sampled(rows: Sequence[Row], samples: int, jobs: int, progress: Progress, heading: str) -> Curve:
+    if samples < 1:
+        raise InputError(f"specificity of {samples} samples says nothing; expected 1 or more.")
     parts = [min(PART, samples - start) for start in range(0, samples, PART)]
     tasks = [(row, number, count) for row in rows for number, count in enumerate(parts)]
     _compile(rows[0])
