@@ -10,7 +10,7 @@ from tonguetrack import InputError
 from tonguetrack.model.midsagittal import midsagittal_vertices
 from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.palate import curve_palate
-from tonguetrack.tracker.registration import FirstGuess, fit_alignment, handedness
+from tonguetrack.tracker.registration import FirstGuess, _Posterior, fit_alignment, handedness
 from tonguetrack.tracker.session import Energy
 from tonguetrack.tracker.simulation import Simulation, simulate
 
@@ -167,6 +167,30 @@ def test_a_stranger_ends_nearer_than_the_uncertainty_says_and_is_not_believed_to
     assert turned < 4.0
     assert found.sure[:2].min() > 0.5
     assert found.residual_mm < 1.5
+
+
+@pytest.mark.parametrize("midsagittal", [True, False])
+def test_the_derivatives_of_the_cost_are_its_slope_with_a_palate_that_is_crossed(model, midsagittal):
+    """Central differences are good to 1e-8 of the largest; the palate's axes are not the model's."""
+    coils, _ = coils_of(model, 1, frames=200)
+    turn, offset = pitch(10.0), np.array([1.0, -20.0, 5.0])
+    y = np.linspace(-10.0, 60.0, 30)
+    low = np.column_stack([0 * y, y, 8.0 - 0.01 * (y - 30.0) ** 2])
+    guess = replace(NEAR, rotation=turn, translation_mm=offset)
+    palate = curve_palate((low - offset) @ turn, "low")
+    posterior = _Posterior(model, (coils - offset) @ turn, ROLES, guess, palate, midsagittal)
+    places = posterior.first_places()[1]
+    random = np.random.default_rng(0)
+    unknowns = random.normal(size=len(posterior.begin(places))) * 0.1
+    _, slope = posterior._value_and_slope(unknowns, places)
+    bound = posterior._value(unknowns, places)[2]
+    assert bound is not None and bound.value > 0.1
+    steps = 1e-6 * np.eye(len(unknowns))
+    around = [
+        [posterior.value(unknowns + sign * step, places, posterior.noise_mm) for sign in (1, -1)]
+        for step in steps
+    ]
+    assert slope == pytest.approx(np.diff(around)[:, 0] / -2e-6, abs=1e-6 * np.abs(slope).max())
 
 
 def test_the_guess_counts_from_where_it_leads(simple):

@@ -12,13 +12,13 @@ from pathlib import Path
 VARIABLE = "NUMBA_CACHE_DIR"
 KERNEL_MODULES = {
     "drivers.devices.rtc3d_decode": "RTC3D",
+    "tracker.alignmentterms": "calibration",
     "tracker.anatomy": "joint speaker",
     "tracker.filters": "live smoothing",
     "tracker.guard": "coil guard",
     "tracker.headcorrection": "head correction",
     "tracker.kernels": "solver",
     "tracker.preparation": "head correction of live frames",
-    "tracker.registration": "calibration",
 }
 """Every module with compiled functions, and what they are for."""
 _PACKAGE = Path(__file__).parent

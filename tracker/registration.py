@@ -32,19 +32,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .. import InputError
 from ..model.midsagittal import midsagittal_vertices, upper_surface_vertices
 from ..model.multilinear import Mode, TongueModel
+from .alignmentterms import FrameTerms, Term, mean_frame, motion_about, palate_bound
 from .anatomy import SpeakerEstimator
 from .coilmap import LATERAL_ROLES, TONGUE_ROLES
 from .correspondences import Correspondences, Places, complete_frames, slid_along_contour
-from .kernels import OPTIONS
 from .palate import Palate
 from .pose import FloatArray
 from .session import Energy
@@ -72,7 +70,6 @@ ADAPTATIONS = 4  # between two slides along the contour
 COOLING = 0.6  # by which the noise may fall between two slides: with less noise, places are harder to leave
 FULL_STEPS, TRIAL_STEPS = 60, 12  # of a descent; of one that only compares places
 UNITS = (2.0, 0.05)  # mm and radians of one step of the search
-DIFFERENCE = 1e-5
 CURVATURE_STEP = 0.02  # in units of the search: less than the kinks of the palate, more than rounding
 FAR_FROM_GUESS = 2.5  # standard deviations
 
@@ -268,102 +265,6 @@ def _settled(posterior: Callable[[], _Posterior]) -> tuple[_Posterior, _Found]:
     return min(settled, key=lambda one: one[0].value(one[1].unknowns, one[1].places, noise))
 
 
-class Term(NamedTuple):
-    """value: of the mean frame; slope: (m,) its derivatives in the raw speaker weights; motion_slope: (4, 3) those in
-    the rotation matrix, then in the translation."""
-
-    value: float
-    slope: FloatArray
-    motion_slope: FloatArray
-
-
-class FrameTerms(NamedTuple):
-    """whole: -log Normal of coils in any pose; beside: of what no pose can follow; off: (axes,) to be added to
-    coils for their deviation from what is expected; gain: (n, axes) of the pose; inverse: (axes, axes) of the
-    expected covariance; directions: (n, axes) d v / d p."""
-
-    whole: Term
-    beside: Term
-    off: FloatArray
-    gain: FloatArray
-    inverse: FloatArray
-    directions: FloatArray
-
-
-@njit(**OPTIONS)
-def rotation_about(turn: FloatArray) -> FloatArray:
-    """(3, 3) from a rotation vector (3,), radians."""
-    angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
-    rotation = np.eye(3)
-    if angle > 0.0:
-        x, y, z = turn[0] / angle, turn[1] / angle, turn[2] / angle
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        rotation = rotation + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
-    return rotation
-
-
-@njit(**OPTIONS)
-def mean_frame(
-    core: FloatArray, origin: FloatArray, speaker: FloatArray, pose_mean: FloatArray, pose_covariance: FloatArray,
-    frames_mean: FloatArray, frames_covariance: FloatArray, rotation: FloatArray, translation: FloatArray,
-    axes: NDArray[np.int64], noise_mm: float,
-) -> FrameTerms:  # fmt: skip
-    """The terms of the mean frame: core (m, n, a) and origin (a,) at the coils' measured axes (a,), which are
-    indices into the coordinates (3n,) of frames_mean and frames_covariance, these before the motion."""
-    speakers, poses, size = core.shape
-    turned = np.zeros((size, frames_mean.shape[0]))
-    middle = np.zeros(size)
-    for row in range(size):
-        coil, axis = axes[row] // 3, axes[row] % 3
-        middle[row] = translation[axis]
-        for other in range(3):
-            turned[row, 3 * coil + other] = rotation[axis, other]
-            middle[row] += rotation[axis, other] * frames_mean[3 * coil + other]
-    spread = turned @ frames_covariance @ turned.T
-    directions = np.zeros((poses, size))
-    for weight in range(speakers):
-        directions += speaker[weight] * core[weight]
-    answering = pose_covariance @ directions
-    expected_middle = origin + pose_mean @ directions
-    off = middle - expected_middle
-    inverse = np.linalg.inv(directions.T @ answering + noise_mm**2 * np.eye(size))
-    pull = inverse @ off
-    value = 0.5 * (np.sum(inverse * spread) + np.sum(off * pull) - np.linalg.slogdet(inverse)[1])
-    narrower = inverse - inverse @ spread @ inverse - np.outer(pull, pull)
-    by_direction = answering @ narrower - np.outer(pose_mean, pull)
-    # The best of all poses, usual or not, leaves what is across their directions.
-    following = np.linalg.pinv(directions)
-    across = (np.eye(size) - following @ directions) / noise_mm**2
-    left = across @ off
-    beside = 0.5 * (np.sum(across * spread) + np.sum(off * left)) + np.trace(across) * noise_mm**2 * np.log(
-        noise_mm
-    )
-    moments = spread + np.outer(off, off)
-    beside_by_direction = -np.outer(pose_mean, left) - following.T @ moments @ across
-    slopes = np.zeros((2, speakers))
-    for weight in range(speakers):
-        slopes[0, weight] = np.sum(core[weight] * by_direction)
-        slopes[1, weight] = np.sum(core[weight] * beside_by_direction)
-    # Both are quadratic in the coils, with these matrices.
-    quadratics = np.empty((2, size, size))
-    quadratics[0], quadratics[1] = inverse, across
-    motion_slopes = np.zeros((2, 4, 3))
-    for term in range(2):
-        by_turned = quadratics[term] @ turned @ frames_covariance
-        by_middle = quadratics[term] @ off
-        for row in range(size):
-            coil, axis = axes[row] // 3, axes[row] % 3
-            motion_slopes[term, 3, axis] += by_middle[row]
-            for other in range(3):
-                motion_slopes[term, axis, other] += by_turned[row, 3 * coil + other]
-                motion_slopes[term, axis, other] += by_middle[row] * frames_mean[3 * coil + other]
-    # The most probable pose = mean + gain @ (coils - expected).
-    return FrameTerms(
-        Term(value, slopes[0], motion_slopes[0]), Term(beside, slopes[1], motion_slopes[1]), -expected_middle,
-        answering @ inverse, inverse, directions,
-    )  # type: ignore[arg-type]  # fmt: skip
-
-
 @dataclass(frozen=True)
 class _Found:
     """An end of the search. unknowns: motion, then the speaker in measured sigma; value: J there."""
@@ -410,7 +311,8 @@ class _Posterior:
         surface = upper_surface_vertices(model) if self._lateral else np.zeros(0, dtype=np.intp)
         self.candidates: NDArray[np.intp] = np.concatenate([contour, surface])
         self._model = model.at([int(vertex) for vertex in self.candidates])
-        self._contour = self._model.at(range(len(contour)))
+        along = self._model.at(range(len(contour)))
+        self._contour_arrays = np.array(along.core), np.array(along.origin)
         self._surface = self._model.at(range(len(contour), len(self.candidates)))
         self._mean = self._model.mean_vertices()
         steps = np.linalg.norm(np.diff(self._mean[: len(contour), 1:], axis=0), axis=1)
@@ -426,6 +328,10 @@ class _Posterior:
         self._sd = np.array(
             [guess.translation_sd_mm] * self._shifts + [np.radians(guess.rotation_sd_deg)] * turns
         )
+        if palate is not None:
+            back_and_up = palate.directions @ guess.rotation.T
+            places_mm = np.array(palate.curve) + (back_and_up @ guess.translation_mm)[:, None]
+            self._palate_arrays = back_and_up, places_mm
         # The axes that are measured: across the plane, projected coils say nothing.
         self._axes = np.flatnonzero(np.tile([not midsagittal, True, True], len(roles))).astype(np.int64)
         self.noise_mm = MODEL_NOISE_MM
@@ -440,6 +346,7 @@ class _Posterior:
         self._middle_of_frames = flat.mean(axis=0)
         self._spread = np.cov(flat.T, bias=True) if len(flat) > 1 else np.zeros((flat.shape[1],) * 2)
         self.shown = _evenly(flat.reshape(len(flat), -1, 3), SHOWN_FRAMES)
+        self._under_palate = np.array(self.shown[::PALATE_STRIDE].reshape(-1, flat.shape[1]), order="C")
 
     # Where to begin ---------------------------------------------------------------------------------
 
@@ -483,12 +390,16 @@ class _Posterior:
 
     def _rigid(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation and translation from the guess's frame to the model's."""
-        turn = np.zeros(3)
+        motion = self._motion_and_slopes(unknowns)[0]
+        return motion[:3], motion[3]
+
+    def _motion_and_slopes(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of `motion_about`, for these unknowns."""
+        turn, shift = np.zeros(3), np.zeros(3)
         turn[: self.size - self._shifts] = unknowns[self._shifts : self.size]
-        shift = np.zeros(3)
         shift[-self._shifts :] = unknowns[: self._shifts]
-        rotation = rotation_about(turn)
-        return rotation, self._centre - rotation @ self._centre + shift
+        motion, slopes = motion_about(self._centre, shift, turn)
+        return motion, slopes
 
     def whole_motion(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3) and translation (3,) from the coils as they were given to the model's frame."""
@@ -522,50 +433,44 @@ class _Posterior:
         self.noise_mm = own
         return value
 
-    def _value(self, unknowns: FloatArray, places: Places) -> tuple[float, FrameTerms, float]:
-        """J; of it, the frames' terms and the palate's part."""
+    def _value(self, unknowns: FloatArray, places: Places) -> tuple[float, FrameTerms, Term | None]:
+        """J; of it, the frames' terms and the palate's."""
         frame = self._frame_terms(unknowns, places, self.noise_mm)
         poses, frames = self._independent(self._poses_seen), self._independent(self._frames)
         value = poses * frame.whole.value + (frames - poses) * frame.beside.value
-        value += 0.5 * float(np.sum(unknowns[self.size :] ** 2))
-        value += 0.5 * float(np.sum((unknowns[: self.size] / self._sd) ** 2))
+        value += 0.5 * float(unknowns[self.size :] @ unknowns[self.size :])
+        away = unknowns[: self.size] / self._sd
+        value += 0.5 * float(away @ away) + self._cost_of_sliding(places)
+        if self._palate is None:
+            return value, frame, None
+        bound = self._bound(unknowns, places, frame)
+        return value + bound.value, frame, bound
+
+    def _cost_of_sliding(self, places: Places) -> float:
+        """Of places beside the middle, and of the tip's from the usual one."""
+        value = 0.0
         for index in self._middle:
             value += 0.5 * float(self._mean[places[index], 0] ** 2) / ASIDE_SD_MM**2
             if self._roles[index] == "tongue_tip":
-                slid = self._along[places[index]] - USUAL_PLACES_MM["tongue_tip"]
+                slid = float(self._along[places[index]]) - USUAL_PLACES_MM["tongue_tip"]
                 value += 0.5 * (slid / TIP_PLACE_SD_MM) ** 2
-        bound = 0.0
-        if self._palate is not None:
-            heights = np.sort(self._heights(unknowns, frame))
-            worst = heights[-max(1, round(WORST_SHARE * len(heights))) :]
-            bound = 0.5 * (float(np.maximum(worst, 0.0).mean()) / PALATE_SD_MM) ** 2
-        return value + bound, frame, bound
+        return value
 
     def _value_and_slope(self, unknowns: FloatArray, places: Places) -> tuple[float, FloatArray]:
-        """J and its derivatives (k,): exact, but the palate's part by differences."""
+        """J and its derivatives (k,)."""
         value, frame, bound = self._value(unknowns, places)
         poses, frames = self._independent(self._poses_seen), self._independent(self._frames)
         speaker_slope, by_motion = (
             poses * whole + (frames - poses) * beside
             for whole, beside in zip(frame.whole[1:], frame.beside[1:], strict=True)
         )
+        if bound is not None:
+            speaker_slope, by_motion = speaker_slope + bound.slope, by_motion + bound.motion_slope
         slope = np.concatenate([unknowns[: self.size] / self._sd**2, unknowns[self.size :]])
         slope[: self._shifts] += by_motion[3, -self._shifts :]
-        for index in range(self._shifts, self.size):
-            ahead, behind = unknowns.copy(), unknowns.copy()
-            ahead[index] += DIFFERENCE
-            behind[index] -= DIFFERENCE
-            (rotation, translation), (rotation_before, translation_before) = (
-                self._rigid(ahead), self._rigid(behind),
-            )  # fmt: skip
-            turned = np.vstack([rotation - rotation_before, translation - translation_before])
-            slope[index] += float(np.sum(by_motion * turned)) / (2.0 * DIFFERENCE)
+        turned = self._motion_and_slopes(unknowns)[1][: self.size - self._shifts]
+        slope[self._shifts : self.size] += np.tensordot(turned, by_motion)
         slope[self.size :] += speaker_slope * self._speaker_sd
-        if bound > 0.0:
-            for index, unit in enumerate(self._units):
-                there = unknowns.copy()
-                there[index] += DIFFERENCE * unit
-                slope[index] += (self._value(there, places)[2] - bound) / (DIFFERENCE * unit)
         return value, slope
 
     def _frame_terms(self, unknowns: FloatArray, places: Places, noise_mm: float) -> FrameTerms:
@@ -577,19 +482,26 @@ class _Posterior:
             )  # fmt: skip
         core, origin = self._at_places[places]
         rotation, translation = self._rigid(unknowns)
-        return mean_frame(
+        found: FrameTerms = mean_frame(
             core, origin, self.speaker(unknowns), self._pose_mean, self._pose_covariance, self._middle_of_frames,
             self._spread, rotation, translation, self._axes, noise_mm,
         )  # fmt: skip
+        return found
+
+    def _bound(self, unknowns: FloatArray, places: Places, frame: FrameTerms) -> Term:
+        """The palate's part; frame: the terms there."""
+        rotation, translation = self._rigid(unknowns)
+        found: Term = palate_bound(
+            *self._contour_arrays, self._at_places[places][0], self.speaker(unknowns), self._pose_mean,
+            self._pose_covariance, frame, self._under_palate, rotation, translation, self._axes, self.noise_mm,
+            *self._palate_arrays, max(1, round(WORST_SHARE * len(self._under_palate))), PALATE_SD_MM,
+        )  # fmt: skip
+        return found
 
     def _poses(self, unknowns: FloatArray, frame: FrameTerms) -> FloatArray:
         """(T, n) the poses of the shown frames that the coils make most probable."""
         coils = self.moved(unknowns).reshape(len(self.shown), -1)[:, self._axes]
         return np.asarray(self._pose_mean + (coils + frame.off) @ frame.gain.T)
-
-    def _heights(self, unknowns: FloatArray, frame: FrameTerms) -> FloatArray:
-        some = self._poses(unknowns, frame)[::PALATE_STRIDE]
-        return self.heights(_shapes(self._contour, self.speaker(unknowns), some), unknowns)
 
     def heights(self, contours: FloatArray, unknowns: FloatArray) -> FloatArray:
         """(T,) mm by which contours (T, c, 3) rise above the palate at the most; minus infinity without overlap."""
