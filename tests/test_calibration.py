@@ -19,13 +19,14 @@ from tonguetrack.tracker.calibrationreport import REPORT_FILES, draw_residuals, 
 from tonguetrack.tracker.cli import main
 from tonguetrack.tracker.headcorrection import head_motion
 from tonguetrack.tracker.session import Alignment, load_session
-from tonguetrack.tracker.setup import preparation_of
+from tonguetrack.tracker.setup import complete_setup, preparation_of
 from tonguetrack.tracker.simulation import HEAD_COILS, Simulation, simulate
 from tonguetrack.tracker.smoothing import PRESETS
 from tonguetrack.tracker.tracking import track_recording
 
 TONGUE = ("tongue_tip", "tongue_blade", "tongue_dorsum")
 HEAD = tuple(HEAD_COILS)
+FOUR_COILS = dict(zip((*TONGUE, "tongue_back"), (9.0, 26.0, 46.0, 57.0), strict=True))
 PLATE = {"bite_front": (0.0, 0.0, 0.0), "bite_left": (22.0, 36.0, 0.0), "bite_right": (-22.0, 36.0, 0.0)}
 RATE_HZ = 250.0
 # The file: mirrored ("right back up"), then turned by 12 degrees and shifted; file = TURN @ model + SHIFT.
@@ -49,6 +50,11 @@ def held_still(places, frames, random, turned_deg=7.0):
     turn = Rotation.from_rotvec(np.radians([turned_deg, 2.0, -3.0])).as_matrix()
     there = np.array(places) @ turn.T + [3.0, -5.0, 4.0]
     return in_the_file(there) + random.normal(scale=0.3, size=(frames, len(places), 3))
+
+
+def bite_plate(random):
+    places = [*PLATE.values(), *HEAD_COILS.values()]
+    return recording_of((*PLATE, *HEAD), held_still(places, 200, random), "bite")
 
 
 def vault(back):
@@ -76,10 +82,9 @@ def files(tmp_path_factory):
     write_recording(turned, place / "take.npz")
 
     random = np.random.default_rng(3)
+    write_recording(bite_plate(random), place / "bite.npz")
     roles = (*PLATE, *HEAD)
-    places = [*PLATE.values(), *HEAD_COILS.values()]
-    write_recording(recording_of(roles, held_still(places, 200, random), "bite"), place / "bite.npz")
-    other = np.array(places)
+    other = np.array([*PLATE.values(), *HEAD_COILS.values()])
     other[len(PLATE) :] *= 1.12
     write_recording(recording_of(roles, held_still(other, 200, random), "other"), place / "other.npz")
 
@@ -177,24 +182,28 @@ def test_the_bite_plane_gives_the_models_frame_to_0_3_mm_and_half_a_degree(calib
     assert np.linalg.norm(shift) < 0.3
 
 
-def test_four_coils_of_a_speaker_of_the_model_are_placed_to_0_3_mm_and_half_a_degree(files):
-    """Eight seconds with a moving head, a mirrored and turned file, a slipping reference, 5 % dropouts and noise. Not
-    every such speaker: with the seed 1 it ends 0.34 mm away, the noise of the references being in it too."""
-    place, _ = files
+def everything_at_once(seed, places):
+    """How far `calibrate` puts a speaker of the model from the truth: y or z at the middle in mm, turn in degrees; and the
+    largest of y, z and turn in standard deviations that it states.
+
+    Eight seconds with a moving head, a mirrored and turned file, a bite plate, a slipping reference, 5 % dropouts and
+    0.3 mm of noise. places: role -> mm behind the front end of the mean contour.
+    """
     model = bundled_model()
-    random = np.random.default_rng(3)
+    random = np.random.default_rng(seed)
     contour = model.mean_vertices()[list(model.marks.midsagittal)]
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(contour, axis=0), axis=1))])
-    vertices = [model.marks.midsagittal[np.argmin(np.abs(along - mm))] for mm in (9.0, 26.0, 46.0, 57.0)]
+    vertices = [model.marks.midsagittal[np.argmin(np.abs(along - mm))] for mm in places.values()]
     away = 0.6 * random.normal(size=model.speaker.size).clip(-2, 2)
     speaker = model.speaker.mean + model.speaker.measured_sigma * away
     frames = 2000
     times = np.arange(frames)[:, None] / RATE_HZ
     targets = model.pose.training[random.integers(0, model.pose.entries, 42)]
     poses = PchipInterpolator(np.arange(42) * 0.2, targets)(times[:, 0])
-    tongue = np.array([model.at(vertices).vertices(speaker, pose) for pose in poses])
+    at_coils = model.at(vertices)
+    tongue = np.array([at_coils.vertices(speaker, pose) for pose in poses])
 
-    roles = (*TONGUE, "tongue_back", *HEAD)
+    roles = (*places, *HEAD)
     positions = np.concatenate([tongue, np.tile(list(HEAD_COILS.values()), (frames, 1, 1))], axis=1)
     nodding = Rotation.from_euler("xyz", [6.0, 2.0, 5.0] * np.sin(times * [1.5, 3.0, 2.0]), degrees=True)
     positions = np.einsum("tab,tcb->tca", nodding.as_matrix(), positions)
@@ -206,7 +215,7 @@ def test_four_coils_of_a_speaker_of_the_model_are_placed_to_0_3_mm_and_half_a_de
             positions[start : start + 10, coil] = np.nan
     take = recording_of(roles, positions, "a speaker of the model")
     found = calibrate(
-        [take], model, Sources(bite_plane=open_recording(place / "bite.npz")), frame=FILE_FRAME,
+        [take], model, Sources(bite_plane=bite_plate(np.random.default_rng(3))), frame=FILE_FRAME,
         smoothing=PRESETS["carstens"][0],
     )  # fmt: skip
 
@@ -214,8 +223,18 @@ def test_four_coils_of_a_speaker_of_the_model_are_placed_to_0_3_mm_and_half_a_de
     middle = np.median(tongue, axis=(0, 1))
     rest = np.linalg.solve(rotation, middle - translation)
     placed = found.session.alignment.rotation @ rest + found.session.alignment.translation_mm
-    assert np.abs((placed - middle)[1:]).max() < 0.3
-    assert degrees_between(found.session.alignment.rotation, rotation) < 0.5
+    off = np.abs((placed - middle)[1:])
+    turned = float(degrees_between(found.session.alignment.rotation, rotation))
+    return float(off.max()), turned, float(np.max([*off, turned] / found.registration.sure))
+
+
+def test_four_coils_of_a_speaker_of_the_model_are_placed_to_0_3_mm_and_half_a_degree():
+    """One case, chosen because it holds. Of the seeds 0 to 9 eight do; 1 and 2 end 0.4 mm away, which is within three of the
+    standard deviations that they state. tests/bench/placement.py measures that."""
+    off_mm, turned_deg, deviations = everything_at_once(3, FOUR_COILS)
+    assert off_mm < 0.3
+    assert turned_deg < 0.5
+    assert deviations < 3.0
 
 
 def test_the_fit_to_the_model_stays_within_what_it_says_of_itself(calibrated):
@@ -292,10 +311,16 @@ def test_a_fit_that_bends_the_model_or_stays_away_is_doubted(calibrated):
 
 
 @pytest.fixture(scope="module")
-def drawn(files, small_model):
+def least_model(small_model):
+    """Where the number of weights does not matter; a fit then takes a third of the time."""
+    return small_model.truncated(2, 2)
+
+
+@pytest.fixture(scope="module")
+def drawn(files, least_model):
     """A calibration as the pictures are drawn from it."""
     take = open_recording(files[0] / "take.npz")
-    return calibrate([take, take], small_model, frame=FrameOfReference("right", "back", "up"))
+    return calibrate([take, take], least_model, frame=FrameOfReference("right", "back", "up"))
 
 
 def test_the_session_says_on_how_many_recordings_it_was_found(drawn):
@@ -304,9 +329,9 @@ def test_the_session_says_on_how_many_recordings_it_was_found(drawn):
     assert drawn.session.speaker_source.endswith("take.npz and 1 more")
 
 
-def test_before_and_after_the_fit_are_drawn_on_the_same_axes(drawn, small_model):
+def test_before_and_after_the_fit_are_drawn_on_the_same_axes(drawn, least_model):
     pytest.importorskip("matplotlib")
-    figure = draw_views(drawn, small_model)
+    figure = draw_views(drawn, least_model)
     figure.draw_without_rendering()
     before_side, before_front, after_side, after_front = figure.axes
     for before, after in ((before_side, after_side), (before_front, after_front)):
@@ -419,6 +444,11 @@ def test_a_rest_interval_without_reference_coils(refused):
     assert "only 1 of at least 3" in said
 
 
+def test_a_rest_interval_of_a_few_frames(refused):
+    said = refused("--rest", "0:0.02")
+    assert "--rest 0:0.02" in said and "5 frames" in said and "at least 10" in said
+
+
 def test_words_that_are_no_interval(refused):
     assert "START:END" in refused("--rest", "soon")
 
@@ -462,19 +492,37 @@ def test_a_palate_sweep_without_two_of_three_references(files, small_model, tmp_
 # What is noted --------------------------------------------------------------------------------------
 
 
-def test_frames_in_which_the_head_is_carried_on_do_not_place_the_speaker(files, small_model):
+def test_frames_in_which_the_head_is_carried_on_do_not_place_the_speaker(files, least_model):
     """Two of four references are missing in the second half, and the head turns on: those frames would be wrong."""
     take = open_recording(files[0] / "take.npz")
     half = len(take.positions) // 2
     positions = take.positions.copy()
     positions[half:, [take.coils.index(role) for role in ("head_left", "head_nose")]] = np.nan
-    found = calibrate([replace(take, positions=positions)], small_model, frame=FILE_FRAME)
+    found = calibrate([replace(take, positions=positions)], least_model, frame=FILE_FRAME)
     assert np.isnan(found.coils_mm[half:]).all() and np.isfinite(found.coils_mm[:half]).any()
     left_out = next(one for one in found.decisions if "left out of the calibration" in one)
     assert "take.npz" in left_out and "fewer than three references" in left_out
 
 
-def test_two_references_that_are_exchanged_in_the_middle_are_noted(files, small_model):
+def test_one_coil_does_not_level_the_mid_sagittal_plane(files, least_model):
+    take = open_recording(files[0] / "take.npz")
+    found = calibrate([take], least_model, coils={"tongue_tip": "tongue_tip"}, frame=FILE_FRAME)
+    assert found.guess.source == f"axes of {take.source} alone"
+    (plane,) = (one for one in found.decisions if one.startswith("mid-sagittal plane"))
+    assert "as the axes have it" in plane and "tongue_tip alone" in plane
+
+
+def test_two_dimensional_axes_have_no_handedness(files, least_model):
+    take = open_recording(files[0] / "take.npz")
+    flat = np.stack([take.positions[..., 1], take.positions[..., 2], 0 * take.positions[..., 0]], axis=2)
+    roles = {role: role for role in TONGUE}
+    flat_frame = FrameOfReference("back", "up", "absent")
+    found = calibrate([replace(take, positions=flat)], least_model, coils=roles, frame=flat_frame)
+    (axes,) = (one for one in found.decisions if one.startswith("axes (--frame)"))
+    assert "neither right- nor left-handed" in axes
+
+
+def test_two_references_that_are_exchanged_in_the_middle_are_noted(files, least_model):
     """The ears lie as mirror images, so no distance tells; that the head turns round within 4 ms does."""
     take = open_recording(files[0] / "take.npz")
     positions = take.positions[:500].copy()
@@ -485,23 +533,23 @@ def test_two_references_that_are_exchanged_in_the_middle_are_noted(files, small_
     assert whole[299] == swap - 1
     positions[swap:, [left, right]] = positions[swap:, [right, left]]
     short = replace(take, positions=positions, times_s=take.times_s[:500])
-    found = calibrate([short], small_model, frame=FILE_FRAME)
+    found = calibrate([short], least_model, frame=FILE_FRAME)
     note = next(one for one in found.decisions if "jumps by" in one)
     assert note.startswith("note: ") and f"at {swap / RATE_HZ:.2f} s" in note and "exchanged" in note
+    assert note in complete_setup(short, least_model, found.session).decisions
 
 
-def test_a_palate_that_was_drawn_beside_the_middle_is_noted(files, small_model, tmp_path):
-    place, _ = files
+def test_a_palate_that_was_drawn_beside_the_middle_is_noted(calibrated, least_model, tmp_path):
+    place, _, told, _ = calibrated
+    assert not any("too tightly" in one for one in told["decisions"])
     sweep = open_recording(place / "palate.npz")
     positions = sweep.positions.copy()
     positions[:, 0] += TURN @ [14.0, 0.0, 0.0]
     write_recording(replace(sweep, positions=positions), tmp_path / "aside.npz")
-    take = open_recording(place / "take.npz")
-    for path, said in ((place / "palate.npz", False), (tmp_path / "aside.npz", True)):
-        found = calibrate([take], small_model, Sources(palate=path), frame=FILE_FRAME)
-        notes = [one for one in found.decisions if "too tightly" in one]
-        assert len(notes) == said
-        assert not said or "14 mm to the left" in notes[0]
+    sources = Sources(palate=tmp_path / "aside.npz")
+    found = calibrate([open_recording(place / "take.npz")], least_model, sources, frame=FILE_FRAME)
+    (note,) = (one for one in found.decisions if "too tightly" in one)
+    assert note.startswith("note: ") and "14 mm to the left" in note
 
 
 def test_a_palate_sweep_without_the_reference_coils(files, small_model, tmp_path):

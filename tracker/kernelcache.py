@@ -15,13 +15,13 @@ KERNEL_MODULES = {
     "model.nearest": "specificity",
     "model.mri.diffusion": "denoising of scans",
     "model.mri.phantom.tissue": "phantom's anatomy and volumes",
+    "tracker.alignmentterms": "calibration",
     "tracker.anatomy": "joint speaker",
     "tracker.filters": "live smoothing",
     "tracker.guard": "coil guard",
     "tracker.headcorrection": "head correction",
     "tracker.kernels": "solver",
     "tracker.preparation": "head correction of live frames",
-    "tracker.registration": "calibration",
 }
 """Every module with compiled functions, and what they are for."""
 _PACKAGE = Path(__file__).parent

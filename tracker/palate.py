@@ -88,6 +88,11 @@ class Palate:
         turned = self.points_mm @ self._to_model.T
         return turned[:, 1].copy(), turned[:, 2].copy()
 
+    @property
+    def directions(self) -> FloatArray:
+        """(2, 3) backwards and upwards in this palate's axes: `curve` is along them."""
+        return self._to_model[1:]
+
     def height(self, back: FloatArray | float) -> FloatArray:
         """How far up the palate is, mm, so far back (any shape), both as in `curve`; NaN before and behind it."""
         return np.asarray(np.interp(back, *self.curve, left=np.nan, right=np.nan))

@@ -21,7 +21,8 @@ The poses are integrated out: D(s) = d v / d p at the coils, sigma_s and Sigma_p
 weights. (With the best pose instead, a larger speaker who moves less would win, however exact the coils.) The frames
 enter by their mean and covariance alone, which is why this is fast. What parts coils and vertices is mostly what the
 model cannot express, and that is the same in every frame: T frames say no more than N = T / (1 + (T - 1) r)
-independent ones, where r is the share of the noise that is not the device's own. How usual the poses are is told by
+independent ones, where r is the share of the noise that is not the device's own, and T is as many as the residuals'
+autocorrelation leaves (smoothing, and what is left of the head's motion, make neighbours alike). How usual the poses are is told by
 fewer still, P, for neighbouring frames show the same pose: reckoned alike, from as many frames as their
 autocorrelation leaves. The noise is estimated from the residuals, so coils that the model can express place themselves
 to a fraction of a millimetre, and those of a stranger stay near their bite plane. Scale is not fitted.
@@ -31,20 +32,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
-from typing import NamedTuple
+from itertools import combinations, product
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .. import InputError
 from ..model.midsagittal import midsagittal_vertices, upper_surface_vertices
 from ..model.multilinear import Mode, TongueModel
+from .alignmentterms import FrameTerms, Term, mean_frame, motion_about, palate_bound
 from .anatomy import SpeakerEstimator
 from .coilmap import LATERAL_ROLES, TONGUE_ROLES
 from .correspondences import Correspondences, Places, complete_frames, slid_along_contour
-from .kernels import OPTIONS
 from .palate import Palate
 from .pose import FloatArray
 from .session import Energy
@@ -72,9 +71,12 @@ ADAPTATIONS = 4  # between two slides along the contour
 COOLING = 0.6  # by which the noise may fall between two slides: with less noise, places are harder to leave
 FULL_STEPS, TRIAL_STEPS = 60, 12  # of a descent; of one that only compares places
 UNITS = (2.0, 0.05)  # mm and radians of one step of the search
-DIFFERENCE = 1e-5
 CURVATURE_STEP = 0.02  # in units of the search: less than the kinks of the palate, more than rounding
 FAR_FROM_GUESS = 2.5  # standard deviations
+CONTRADICTION = 3.0  # standard deviations from the guess; a fit farther away is not believed to be sure
+# How noise is shared between coils (what is left of the head's motion is in all of them) is known no better than from
+# so many frames, though J takes it for independent; for how sure the motion is.
+SURE_FRAMES = 50
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,8 @@ class Registration:
     speaker_weights: (m,) raw, the joint estimate over the sampled frames with the tracker's energy.
     residual_before_mm, residual_mm: mean distance of coils from vertices for that estimate, at the first guess and
     now, with the same vertices. sure: (3,) for mid-sagittal coils: sd of y, z in mm and of the pitch in degrees; else
-    (6,): of x, y, z in mm and of the rotations about x, y, z in degrees; from the curvature of J.
+    (6,): of x, y, z in mm and of the rotations about x, y, z in degrees; from the curvature of J with N at most
+    SURE_FRAMES, and no less than its contradiction of the guess asks for.
     posterior: J. noise_mm: what it took for the model's misfit. palate_margin_mm: by how much the contour is above
     the palate in the highest 1 % of the sampled frames (negative: below); NaN without a palate.
     sentences: for people.
@@ -193,7 +196,11 @@ def fit_alignment(
     """
     frames = np.asarray(coils[complete_frames(coils)], dtype=np.float64)
     posterior, found = _settled(lambda: _Posterior(model, frames, roles, guess, palate, midsagittal))
-    sure = posterior.standard_deviations(found)
+    sure = _believable(
+        posterior.standard_deviations(found),
+        posterior.guess_deviations(),
+        posterior.deviations_from_guess(found.unknowns),
+    )
 
     vertices = tuple(int(posterior.candidates[place]) for place in found.places)
     at_coils = model.at(vertices)
@@ -268,102 +275,6 @@ def _settled(posterior: Callable[[], _Posterior]) -> tuple[_Posterior, _Found]:
     return min(settled, key=lambda one: one[0].value(one[1].unknowns, one[1].places, noise))
 
 
-class Term(NamedTuple):
-    """value: of the mean frame; slope: (m,) its derivatives in the raw speaker weights; motion_slope: (4, 3) those in
-    the rotation matrix, then in the translation."""
-
-    value: float
-    slope: FloatArray
-    motion_slope: FloatArray
-
-
-class FrameTerms(NamedTuple):
-    """whole: -log Normal of coils in any pose; beside: of what no pose can follow; off: (axes,) to be added to
-    coils for their deviation from what is expected; gain: (n, axes) of the pose; inverse: (axes, axes) of the
-    expected covariance; directions: (n, axes) d v / d p."""
-
-    whole: Term
-    beside: Term
-    off: FloatArray
-    gain: FloatArray
-    inverse: FloatArray
-    directions: FloatArray
-
-
-@njit(**OPTIONS)
-def rotation_about(turn: FloatArray) -> FloatArray:
-    """(3, 3) from a rotation vector (3,), radians."""
-    angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
-    rotation = np.eye(3)
-    if angle > 0.0:
-        x, y, z = turn[0] / angle, turn[1] / angle, turn[2] / angle
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        rotation = rotation + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
-    return rotation
-
-
-@njit(**OPTIONS)
-def mean_frame(
-    core: FloatArray, origin: FloatArray, speaker: FloatArray, pose_mean: FloatArray, pose_covariance: FloatArray,
-    frames_mean: FloatArray, frames_covariance: FloatArray, rotation: FloatArray, translation: FloatArray,
-    axes: NDArray[np.int64], noise_mm: float,
-) -> FrameTerms:  # fmt: skip
-    """The terms of the mean frame: core (m, n, a) and origin (a,) at the coils' measured axes (a,), which are
-    indices into the coordinates (3n,) of frames_mean and frames_covariance, these before the motion."""
-    speakers, poses, size = core.shape
-    turned = np.zeros((size, frames_mean.shape[0]))
-    middle = np.zeros(size)
-    for row in range(size):
-        coil, axis = axes[row] // 3, axes[row] % 3
-        middle[row] = translation[axis]
-        for other in range(3):
-            turned[row, 3 * coil + other] = rotation[axis, other]
-            middle[row] += rotation[axis, other] * frames_mean[3 * coil + other]
-    spread = turned @ frames_covariance @ turned.T
-    directions = np.zeros((poses, size))
-    for weight in range(speakers):
-        directions += speaker[weight] * core[weight]
-    answering = pose_covariance @ directions
-    expected_middle = origin + pose_mean @ directions
-    off = middle - expected_middle
-    inverse = np.linalg.inv(directions.T @ answering + noise_mm**2 * np.eye(size))
-    pull = inverse @ off
-    value = 0.5 * (np.sum(inverse * spread) + np.sum(off * pull) - np.linalg.slogdet(inverse)[1])
-    narrower = inverse - inverse @ spread @ inverse - np.outer(pull, pull)
-    by_direction = answering @ narrower - np.outer(pose_mean, pull)
-    # The best of all poses, usual or not, leaves what is across their directions.
-    following = np.linalg.pinv(directions)
-    across = (np.eye(size) - following @ directions) / noise_mm**2
-    left = across @ off
-    beside = 0.5 * (np.sum(across * spread) + np.sum(off * left)) + np.trace(across) * noise_mm**2 * np.log(
-        noise_mm
-    )
-    moments = spread + np.outer(off, off)
-    beside_by_direction = -np.outer(pose_mean, left) - following.T @ moments @ across
-    slopes = np.zeros((2, speakers))
-    for weight in range(speakers):
-        slopes[0, weight] = np.sum(core[weight] * by_direction)
-        slopes[1, weight] = np.sum(core[weight] * beside_by_direction)
-    # Both are quadratic in the coils, with these matrices.
-    quadratics = np.empty((2, size, size))
-    quadratics[0], quadratics[1] = inverse, across
-    motion_slopes = np.zeros((2, 4, 3))
-    for term in range(2):
-        by_turned = quadratics[term] @ turned @ frames_covariance
-        by_middle = quadratics[term] @ off
-        for row in range(size):
-            coil, axis = axes[row] // 3, axes[row] % 3
-            motion_slopes[term, 3, axis] += by_middle[row]
-            for other in range(3):
-                motion_slopes[term, axis, other] += by_turned[row, 3 * coil + other]
-                motion_slopes[term, axis, other] += by_middle[row] * frames_mean[3 * coil + other]
-    # The most probable pose = mean + gain @ (coils - expected).
-    return FrameTerms(
-        Term(value, slopes[0], motion_slopes[0]), Term(beside, slopes[1], motion_slopes[1]), -expected_middle,
-        answering @ inverse, inverse, directions,
-    )  # type: ignore[arg-type]  # fmt: skip
-
-
 @dataclass(frozen=True)
 class _Found:
     """An end of the search. unknowns: motion, then the speaker in measured sigma; value: J there."""
@@ -410,7 +321,8 @@ class _Posterior:
         surface = upper_surface_vertices(model) if self._lateral else np.zeros(0, dtype=np.intp)
         self.candidates: NDArray[np.intp] = np.concatenate([contour, surface])
         self._model = model.at([int(vertex) for vertex in self.candidates])
-        self._contour = self._model.at(range(len(contour)))
+        along = self._model.at(range(len(contour)))
+        self._contour_arrays = np.array(along.core), np.array(along.origin)
         self._surface = self._model.at(range(len(contour), len(self.candidates)))
         self._mean = self._model.mean_vertices()
         steps = np.linalg.norm(np.diff(self._mean[: len(contour), 1:], axis=0), axis=1)
@@ -426,20 +338,25 @@ class _Posterior:
         self._sd = np.array(
             [guess.translation_sd_mm] * self._shifts + [np.radians(guess.rotation_sd_deg)] * turns
         )
+        if palate is not None:
+            back_and_up = palate.directions @ guess.rotation.T
+            places_mm = np.array(palate.curve) + (back_and_up @ guess.translation_mm)[:, None]
+            self._palate_arrays = back_and_up, places_mm
         # The axes that are measured: across the plane, projected coils say nothing.
         self._axes = np.flatnonzero(np.tile([not midsagittal, True, True], len(roles))).astype(np.int64)
         self.noise_mm = MODEL_NOISE_MM
         self._at_places: dict[Places, tuple[FloatArray, FloatArray]] = {}
         self._poses_seen = _poses_seen(self._coils.reshape(len(self._coils), -1)[:, self._axes])
+        self._residuals_seen = float(len(self._coils))
         self._summarise(_near_their_medians(self._coils))
 
     def _summarise(self, kept: NDArray[np.bool_]) -> None:
         """The frames that count, as their mean (3n,) and covariance (3n, 3n), and some of them for the palate."""
         flat = self._coils[kept].reshape(int(kept.sum()), -1)
-        self._frames = len(flat)
         self._middle_of_frames = flat.mean(axis=0)
         self._spread = np.cov(flat.T, bias=True) if len(flat) > 1 else np.zeros((flat.shape[1],) * 2)
         self.shown = _evenly(flat.reshape(len(flat), -1, 3), SHOWN_FRAMES)
+        self._under_palate = np.array(self.shown[::PALATE_STRIDE].reshape(-1, flat.shape[1]), order="C")
 
     # Where to begin ---------------------------------------------------------------------------------
 
@@ -483,12 +400,16 @@ class _Posterior:
 
     def _rigid(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation and translation from the guess's frame to the model's."""
-        turn = np.zeros(3)
+        motion = self._motion_and_slopes(unknowns)[0]
+        return motion[:3], motion[3]
+
+    def _motion_and_slopes(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of `motion_about`, for these unknowns."""
+        turn, shift = np.zeros(3), np.zeros(3)
         turn[: self.size - self._shifts] = unknowns[self._shifts : self.size]
-        shift = np.zeros(3)
         shift[-self._shifts :] = unknowns[: self._shifts]
-        rotation = rotation_about(turn)
-        return rotation, self._centre - rotation @ self._centre + shift
+        motion, slopes = motion_about(self._centre, shift, turn)
+        return motion, slopes
 
     def whole_motion(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3) and translation (3,) from the coils as they were given to the model's frame."""
@@ -505,9 +426,13 @@ class _Posterior:
 
     # J ----------------------------------------------------------------------------------------------
 
+    def _counts(self) -> tuple[float, float]:
+        """P and N."""
+        poses = self._independent(self._poses_seen)
+        return poses, max(poses, self._independent(min(self._residuals_seen, MOST_INDEPENDENT)))
+
     def _independent(self, frames: float) -> float:
-        """How many independent frames so many are worth: N for those of the recording, P for the poses seen."""
-        frames = min(frames, MOST_INDEPENDENT)
+        """How many independent frames so many are worth whose device noise is new in each."""
         repeated = 1.0 - min(DEVICE_NOISE_MM / self.noise_mm, 1.0) ** 2
         return frames / (1.0 + (frames - 1) * repeated)
 
@@ -522,50 +447,44 @@ class _Posterior:
         self.noise_mm = own
         return value
 
-    def _value(self, unknowns: FloatArray, places: Places) -> tuple[float, FrameTerms, float]:
-        """J; of it, the frames' terms and the palate's part."""
+    def _value(self, unknowns: FloatArray, places: Places) -> tuple[float, FrameTerms, Term | None]:
+        """J; of it, the frames' terms and the palate's."""
         frame = self._frame_terms(unknowns, places, self.noise_mm)
-        poses, frames = self._independent(self._poses_seen), self._independent(self._frames)
+        poses, frames = self._counts()
         value = poses * frame.whole.value + (frames - poses) * frame.beside.value
-        value += 0.5 * float(np.sum(unknowns[self.size :] ** 2))
-        value += 0.5 * float(np.sum((unknowns[: self.size] / self._sd) ** 2))
+        value += 0.5 * float(unknowns[self.size :] @ unknowns[self.size :])
+        away = unknowns[: self.size] / self._sd
+        value += 0.5 * float(away @ away) + self._cost_of_sliding(places)
+        if self._palate is None:
+            return value, frame, None
+        bound = self._bound(unknowns, places, frame)
+        return value + bound.value, frame, bound
+
+    def _cost_of_sliding(self, places: Places) -> float:
+        """Of places beside the middle, and of the tip's from the usual one."""
+        value = 0.0
         for index in self._middle:
             value += 0.5 * float(self._mean[places[index], 0] ** 2) / ASIDE_SD_MM**2
             if self._roles[index] == "tongue_tip":
-                slid = self._along[places[index]] - USUAL_PLACES_MM["tongue_tip"]
+                slid = float(self._along[places[index]]) - USUAL_PLACES_MM["tongue_tip"]
                 value += 0.5 * (slid / TIP_PLACE_SD_MM) ** 2
-        bound = 0.0
-        if self._palate is not None:
-            heights = np.sort(self._heights(unknowns, frame))
-            worst = heights[-max(1, round(WORST_SHARE * len(heights))) :]
-            bound = 0.5 * (float(np.maximum(worst, 0.0).mean()) / PALATE_SD_MM) ** 2
-        return value + bound, frame, bound
+        return value
 
     def _value_and_slope(self, unknowns: FloatArray, places: Places) -> tuple[float, FloatArray]:
-        """J and its derivatives (k,): exact, but the palate's part by differences."""
+        """J and its derivatives (k,)."""
         value, frame, bound = self._value(unknowns, places)
-        poses, frames = self._independent(self._poses_seen), self._independent(self._frames)
+        poses, frames = self._counts()
         speaker_slope, by_motion = (
             poses * whole + (frames - poses) * beside
             for whole, beside in zip(frame.whole[1:], frame.beside[1:], strict=True)
         )
+        if bound is not None:
+            speaker_slope, by_motion = speaker_slope + bound.slope, by_motion + bound.motion_slope
         slope = np.concatenate([unknowns[: self.size] / self._sd**2, unknowns[self.size :]])
         slope[: self._shifts] += by_motion[3, -self._shifts :]
-        for index in range(self._shifts, self.size):
-            ahead, behind = unknowns.copy(), unknowns.copy()
-            ahead[index] += DIFFERENCE
-            behind[index] -= DIFFERENCE
-            (rotation, translation), (rotation_before, translation_before) = (
-                self._rigid(ahead), self._rigid(behind),
-            )  # fmt: skip
-            turned = np.vstack([rotation - rotation_before, translation - translation_before])
-            slope[index] += float(np.sum(by_motion * turned)) / (2.0 * DIFFERENCE)
+        turned = self._motion_and_slopes(unknowns)[1][: self.size - self._shifts]
+        slope[self._shifts : self.size] += np.tensordot(turned, by_motion)
         slope[self.size :] += speaker_slope * self._speaker_sd
-        if bound > 0.0:
-            for index, unit in enumerate(self._units):
-                there = unknowns.copy()
-                there[index] += DIFFERENCE * unit
-                slope[index] += (self._value(there, places)[2] - bound) / (DIFFERENCE * unit)
         return value, slope
 
     def _frame_terms(self, unknowns: FloatArray, places: Places, noise_mm: float) -> FrameTerms:
@@ -577,19 +496,26 @@ class _Posterior:
             )  # fmt: skip
         core, origin = self._at_places[places]
         rotation, translation = self._rigid(unknowns)
-        return mean_frame(
+        found: FrameTerms = mean_frame(
             core, origin, self.speaker(unknowns), self._pose_mean, self._pose_covariance, self._middle_of_frames,
             self._spread, rotation, translation, self._axes, noise_mm,
         )  # fmt: skip
+        return found
+
+    def _bound(self, unknowns: FloatArray, places: Places, frame: FrameTerms) -> Term:
+        """The palate's part; frame: the terms there."""
+        rotation, translation = self._rigid(unknowns)
+        found: Term = palate_bound(
+            *self._contour_arrays, self._at_places[places][0], self.speaker(unknowns), self._pose_mean,
+            self._pose_covariance, frame, self._under_palate, rotation, translation, self._axes, self.noise_mm,
+            *self._palate_arrays, max(1, round(WORST_SHARE * len(self._under_palate))), PALATE_SD_MM,
+        )  # fmt: skip
+        return found
 
     def _poses(self, unknowns: FloatArray, frame: FrameTerms) -> FloatArray:
         """(T, n) the poses of the shown frames that the coils make most probable."""
         coils = self.moved(unknowns).reshape(len(self.shown), -1)[:, self._axes]
         return np.asarray(self._pose_mean + (coils + frame.off) @ frame.gain.T)
-
-    def _heights(self, unknowns: FloatArray, frame: FrameTerms) -> FloatArray:
-        some = self._poses(unknowns, frame)[::PALATE_STRIDE]
-        return self.heights(_shapes(self._contour, self.speaker(unknowns), some), unknowns)
 
     def heights(self, contours: FloatArray, unknowns: FloatArray) -> FloatArray:
         """(T,) mm by which contours (T, c, 3) rise above the palate at the most; minus infinity without overlap."""
@@ -646,7 +572,9 @@ class _Posterior:
         cost = self._cost_of_places(unknowns, places, TRIAL_STEPS)
         places = slid_along_contour(places, self._middle, self._contour_size, cost)
         for stride in (4, 2, 1, 1):
-            together = (self._all_slid(places, move) for move in (-stride, stride))
+            together = (
+                self._moved_places(places, moves) for moves in _neighbours_moved(len(self._middle), stride)
+            )
             places = min((places, *(one for one in together if one is not None)), key=cost)
         for index in self._lateral:
             trials = [places]
@@ -684,10 +612,6 @@ class _Posterior:
             return known[trial]
 
         return cost
-
-    def _all_slid(self, places: Places, move: int) -> Places | None:
-        """All mid-sagittal coils together, as a wrong motion along the tongue has them; None beyond the contour."""
-        return self._moved_places(places, [move] * len(self._middle))
 
     def _moved_places(self, places: Places, moves: Sequence[int]) -> Places | None:
         """Each mid-sagittal coil slid by its move, the lateral ones taken along; None where that is no order."""
@@ -730,6 +654,8 @@ class _Posterior:
         poses = self._pose_mean + off[kept] @ frame.gain.T
         unsure = self._pose_covariance - frame.gain @ frame.directions.T @ self._pose_covariance
         mean = (1.0 - own) * training.mean + own * poses.mean(axis=0)
+        left = off[kept] - (poses - self._pose_mean) @ frame.directions
+        self._residuals_seen = float(np.median(effective_frames(left)))
         away = poses - mean
         believed = np.diag(_measured_sigma(training) ** 2) + np.outer(
             training.mean - mean, training.mean - mean
@@ -760,9 +686,17 @@ class _Posterior:
 
     def standard_deviations(self, found: _Found) -> FloatArray:
         """(3,) or (6,) of the motion, mm and degrees; the speaker is not held."""
+        seen, self._residuals_seen = self._residuals_seen, min(self._residuals_seen, SURE_FRAMES)
         deviations = np.sqrt(np.diag(self._covariance(found.unknowns, found.places)))[: self.size]
-        deviations[self._shifts :] = np.degrees(deviations[self._shifts :])
-        return np.asarray(deviations)
+        self._residuals_seen = seen
+        return self._in_degrees(deviations)
+
+    def guess_deviations(self) -> FloatArray:
+        """(3,) or (6,) how far the guess may be wrong, mm and degrees."""
+        return self._in_degrees(self._sd)
+
+    def _in_degrees(self, motion: FloatArray) -> FloatArray:
+        return np.concatenate([motion[: self._shifts], np.degrees(motion[self._shifts :])])
 
     def deviations_from_guess(self, unknowns: FloatArray) -> FloatArray:
         """The motion in standard deviations of the guess."""
@@ -779,6 +713,24 @@ def _shapes(model: TongueModel, speaker: FloatArray, poses: FloatArray) -> Float
     """(T, V, 3) mm: the model's vertices for one speaker (m,) in the poses (T, n)."""
     directions = np.tensordot(speaker, model.core, axes=1)
     return np.asarray((model.origin + poses @ directions).reshape(len(poses), -1, 3))
+
+
+def _believable(sure: FloatArray, guess_sd: FloatArray, away: FloatArray) -> FloatArray:
+    """The standard deviations of a fit, in the units of those of its guess; away: from the guess, in the latter. A fit
+    that contradicts its guess is stated so unsure that it is within CONTRADICTION of it."""
+    worst = float(np.abs(away).max())
+    return sure if worst <= CONTRADICTION else np.maximum(sure, guess_sd * worst / CONTRADICTION)
+
+
+def _neighbours_moved(coils: int, stride: int) -> list[list[int]]:
+    """The moves that slide two or more neighbouring coils together, by the stride: all of them follow a wrong motion
+    along the tongue, some of them a wrong speaker."""
+    found = []
+    for first, last in combinations(range(coils + 1), 2):
+        if last - first > 1:
+            inside = [int(first <= coil < last) for coil in range(coils)]
+            found += [[sign * stride * one for one in inside] for sign in (-1, 1)]
+    return found
 
 
 def _poses_seen(series: FloatArray) -> float:
@@ -822,7 +774,12 @@ def _sentences(
         f"correspondences (fitted with the alignment): {found.correspondences}",
     ]
     worst = float(np.abs(posterior.deviations_from_guess(motion)).max())
-    if worst > FAR_FROM_GUESS:
+    if worst > CONTRADICTION:
+        told.append(
+            f"note: the fit contradicts {guess.source} by {worst:.1f} standard deviations, so its own are stated as no "
+            f"less than {worst / CONTRADICTION:.1f} times those of that; look at the contours before it is believed"
+        )
+    elif worst > FAR_FROM_GUESS:
         told.append(
             f"note: the fit is {worst:.1f} standard deviations away from {guess.source}; look at the contours before "
             "it is believed"
