@@ -44,7 +44,7 @@ def run_all(
     work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int, progress: Progress, heading: str
 ) -> list[Result]:
     """work(task) for every task, in their order, in so many processes (-1: one for each core)."""
-    from joblib import Parallel, delayed
+    from joblib import Parallel, delayed  # type: ignore[import-untyped]
 
     if jobs == 0 or jobs < -1:
         raise InputError(

@@ -121,7 +121,7 @@ def as_csv(evaluation: Evaluation) -> str:
     for mode, shares in evaluation.compactness.items():
         for component, share in enumerate(shares, 1):
             rows.writerow([COMPACTNESS, mode, "", component, f"{share:.6f}", "", "", ""])
-    groups = (
+    groups: tuple[tuple[str, Mapping[str, Curve], Mapping[str, str]], ...] = (
         (GENERALISATION, evaluation.generalisation, {}),
         (SPECIFICITY, evaluation.specificity, dict.fromkeys(MODES, evaluation.region)),
         (PHONES, evaluation.phones, evaluation.regions),

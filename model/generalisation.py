@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -136,7 +137,7 @@ def _fitted(
     """(m n,) the products of the speaker's and the pose's weights at which the descent from the mean ends."""
     from scipy.optimize import Bounds, minimize
 
-    options = {
+    options: Any = {
         "maxcor": CORRECTIONS,
         "ftol": DECREASE,
         "gtol": SLOPE,

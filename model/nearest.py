@@ -77,7 +77,7 @@ def _single(values: FloatArray) -> Float32Array:
 
 
 @njit(cache=True, fastmath=_FAST)
-def _mean_distance(one: Float32Array, other: Float32Array) -> float:
+def _mean_distance(one: Float32Array, other: Float32Array) -> np.floating:
     """Of points (3, n) each."""
     total = np.float32(0.0)
     for vertex in range(one.shape[1]):
@@ -89,7 +89,7 @@ def _mean_distance(one: Float32Array, other: Float32Array) -> float:
 
 
 @njit(cache=True, fastmath=_FAST)
-def _weighted_distance(one: Float32Array, other: Float32Array, weights: Float32Array) -> float:
+def _weighted_distance(one: Float32Array, other: Float32Array, weights: Float32Array) -> np.floating:
     """Of points (3, g) each; weights (g,) with the sum 1."""
     total = np.float32(0.0)
     for group in range(one.shape[1]):
@@ -115,7 +115,7 @@ def _nearest(
     for sample in range(len(samples)):
         for mesh in range(count):
             bounds[mesh] = _weighted_distance(sample_means[sample], mesh_means[mesh], weights)
-        best = np.float32(np.inf)
+        best: np.floating = np.float32(np.inf)
         for _ in range(count):
             nearest = np.argmin(bounds)
             if bounds[nearest] - np.float32(ROUNDING_MM) >= best:
