@@ -220,7 +220,7 @@ def draw_phones(evaluation: Evaluation) -> Figure:
         if index % columns == 0:
             panel.set_ylabel("mm", size=9)
     panels[0].set_ylim(bottom=0.0)
-    figure.suptitle(f"Specificity of single phones. {_title(evaluation)}", size=9)
+    figure.suptitle(f"Specificity of single phones, {_title(evaluation)}", size=9)
     return figure
 
 
@@ -245,9 +245,9 @@ def _number_components(panel: Axes, mode: str | None, most: int) -> None:
 def _title(evaluation: Evaluation) -> str:
     shapes = evaluation.shapes
     made_up = "; synthetic" if shapes.provenance.get("data", "").startswith("synthetic") else ""
-    text = f"{shapes.source} ({len(shapes.speakers)} speakers x {len(shapes.prompts)} phones{made_up})"
+    text = f"{shapes.source}\n{len(shapes.speakers)} speakers x {len(shapes.prompts)} phones{made_up}"
     if evaluation.generalisation or evaluation.specificity or evaluation.phones:
-        text += ": mean and one standard deviation"
+        text += "; mean and one standard deviation"
     return text
 
 
