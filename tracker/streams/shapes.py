@@ -1,0 +1,365 @@
+"""Avatar shapes: the tongue's pose as named numbers in 0..1, measured on its surface.
+
+A few vertices are landmarks: the tip, and at three places along the tongue (blade, front, body) the middle, both edges
+and the points halfway; and the middle of the back. From them fifteen quantities are measured, each against the same
+speaker's neutral tongue, the one of the mean pose (`AXES`). Most have a shape for either sign (`SHAPES`); a range says
+which value of the quantity makes the shape 0 and which makes it 1. `pose_0` to `pose_<K-1>` are the model's own pose
+directions, re-based (`model/rebasing.py`).
+
+Model frame, mm: x lateral, left positive, y front to back, z up. Left and right are the speaker's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ... import InputError
+from ...model.mesh import vertex_normals
+from ...model.midsagittal import midsagittal_vertices
+from ...model.multilinear import TongueModel
+from ...model.rebasing import Rebased
+from ..pose import FloatArray
+
+SIGMAS = 3.0
+"""Without ranges of a speaker, a shape is 1 where the model's weights reach it within mean +- 3 sigma."""
+LEAST = {"mm": 2.0, "deg": 5.0}
+"""No range is narrower. What a model or a speaker cannot do then stays near 0 instead of being blown up."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A measured quantity. unit: mm or deg; meaning: what makes it grow; rigid: whether it stays as it is when the
+    whole tongue is turned and shifted."""
+
+    name: str
+    unit: str
+    meaning: str
+    rigid: bool = False
+
+
+AXES = (
+    Axis("tip x", "mm", "the tip goes to the left"),
+    Axis("tip y", "mm", "the tip goes to the front"),
+    Axis("tip z", "mm", "the tip goes up"),
+    Axis("body x", "mm", "the middle of front, body and back goes to the left"),
+    Axis("body y", "mm", "the middle of front, body and back goes to the front"),
+    Axis("body z", "mm", "the middle of front, body and back goes up"),
+    Axis("lean", "deg", "the body turns about its length: left edge down, right edge up"),
+    Axis(
+        "out", "mm", "the tip is in front of the upper incisors' edge, y = 0; not against the neutral tongue"
+    ),
+    Axis("curl", "deg", "the line from blade to tip turns up against the line from body to blade", True),
+    Axis("twist", "deg", "the blade turns about the tongue's length against the body: left edge down", True),
+    Axis("width", "mm", "the edges go apart; mean of blade, front and body", True),
+    Axis("length", "mm", "tip, blade, front and body go apart, summed along the middle", True),
+    Axis(
+        "groove",
+        "mm",
+        "the middle sinks below the points halfway to the edges; mean of blade, front, body",
+        True,
+    ),
+    Axis(
+        "dome",
+        "mm",
+        "middle and halfway points rise above the line between the edges; mean of the same",
+        True,
+    ),
+    Axis(
+        "sides", "deg", "the outer halves turn up against the line between the edges; mean of the same", True
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A named shape: the part of an axis with this sign."""
+
+    name: str
+    axis: str
+    sign: int
+
+
+SHAPES = (
+    Shape("tip_forward", "tip y", 1),
+    Shape("tip_back", "tip y", -1),
+    Shape("tip_up", "tip z", 1),
+    Shape("tip_down", "tip z", -1),
+    Shape("tip_left", "tip x", 1),
+    Shape("tip_right", "tip x", -1),
+    Shape("curl_up", "curl", 1),
+    Shape("bend_down", "curl", -1),
+    Shape("body_up", "body z", 1),
+    Shape("body_down", "body z", -1),
+    Shape("body_front", "body y", 1),
+    Shape("body_back", "body y", -1),
+    Shape("body_left", "body x", 1),
+    Shape("body_right", "body x", -1),
+    Shape("wide", "width", 1),
+    Shape("narrow", "width", -1),
+    Shape("long", "length", 1),
+    Shape("short", "length", -1),
+    Shape("groove", "groove", 1),
+    Shape("ridge", "groove", -1),
+    Shape("arched", "dome", 1),
+    Shape("flat", "dome", -1),
+    Shape("roll", "sides", 1),
+    Shape("twist_left", "twist", 1),
+    Shape("twist_right", "twist", -1),
+    Shape("lean_left", "lean", 1),
+    Shape("lean_right", "lean", -1),
+    Shape("out", "out", 1),
+)
+"""A range of such a shape is (value for 0, value for 1) of sign x axis."""
+
+_AXIS_OF_SHAPE = np.array([[axis.name for axis in AXES].index(shape.axis) for shape in SHAPES])
+_SIGN_OF_SHAPE = np.array([float(shape.sign) for shape in SHAPES])
+_UNIT_OF_SHAPE = [AXES[axis].unit for axis in _AXIS_OF_SHAPE]
+
+_OUT = [axis.name for axis in AXES].index("out")
+
+
+class ShapeMeter:
+    """Measures the shapes of one model's poses.
+
+    ranges: shape -> (value for 0, value for 1), in the shape's own unit, of a session's [shapes] or any part of them;
+    the rest is `default_ranges`. Raises InputError for unknown names and for ranges that are none.
+    names: (shapes,) of everything that `measure` returns. Not for several threads at once: it remembers the speaker.
+    """
+
+    def __init__(self, model: TongueModel, ranges: Mapping[str, tuple[float, float]] | None = None) -> None:
+        self._landmarks = landmark_model(model)
+        self.names = shape_names(model.pose.size)
+        self.units = (*_UNIT_OF_SHAPE, *["raw"] * model.pose.size)
+        merged = default_ranges(model) | checked_ranges(ranges or {}, self.names)
+        self.ranges = {name: merged[name] for name in self.names}
+        self._low = np.array([low for low, _ in self.ranges.values()])
+        self._span = np.array([high - low for low, high in self.ranges.values()])
+        self._speaker: FloatArray | None = None
+        self._directions = np.zeros(0)
+        self._neutral = np.zeros(0)
+
+    @property
+    def rebased(self) -> Rebased:
+        """The ranges of `pose_0` to `pose_<K-1>`, as everything that re-bases wants them."""
+        first = len(SHAPES)
+        return Rebased(self._low[first:], self._low[first:] + self._span[first:])
+
+    def raw(self, speaker_weights: FloatArray, weights: FloatArray) -> FloatArray:
+        """(shapes,) what each shape is made of: mm, degrees, or the raw weight."""
+        if self._speaker is None or not np.array_equal(self._speaker, speaker_weights):
+            self._speaker = np.array(speaker_weights, dtype=np.float64)
+            self._directions = np.tensordot(self._speaker, self._landmarks.core, axes=1)
+            self._neutral = axes_of(self._points(self._landmarks.pose.mean))
+            self._neutral[_OUT] = 0.0
+        axes = axes_of(self._points(weights)) - self._neutral
+        return np.concatenate([_SIGN_OF_SHAPE * axes[_AXIS_OF_SHAPE], weights])
+
+    def measure(self, speaker_weights: FloatArray, weights: FloatArray) -> FloatArray:
+        """(shapes,) in 0..1, for raw weights (m,) of the speaker and (K,) of the pose."""
+        unit = (self.raw(speaker_weights, weights) - self._low) / self._span
+        return np.minimum(np.maximum(unit, 0.0), 1.0)
+
+    def _points(self, weights: FloatArray) -> FloatArray:
+        return np.asarray((self._landmarks.origin + weights @ self._directions).reshape(-1, 3))
+
+
+def shape_names(directions: int) -> tuple[str, ...]:
+    """The names of all shapes of a model with so many pose directions, K."""
+    return (*(shape.name for shape in SHAPES), *(f"pose_{k}" for k in range(directions)))
+
+
+def checked_ranges(
+    ranges: Mapping[str, tuple[float, float]], names: tuple[str, ...]
+) -> dict[str, tuple[float, float]]:
+    """The ranges as they are. Raises InputError for a name that is not among these, or low >= high."""
+    for name, (low, high) in ranges.items():
+        if name not in names:
+            raise InputError(f"[shapes] {name}: there is no such shape; expected some of {', '.join(names)}.")
+        if not (np.isfinite([low, high]).all() and low < high):
+            raise InputError(
+                f"[shapes] {name} = [{low:g}, {high:g}]: expected the value for 0 and a larger one for 1."
+            )
+    return dict(ranges)
+
+
+# The landmarks ----------------------------------------------------------------------------------------
+
+STATIONS = {"blade": 0.12, "front": 0.25, "body": 0.40, "back": 0.55}
+"""Where along the mid-sagittal contour of the mean shape, as parts of its length from tip to root."""
+SECTIONS = 3  # the first of the stations have edges
+HALFWAY, EDGE = 0.45, 0.85  # of the half width of the surface that faces up
+SLICE_MM = 2.0  # a section is looked for so far before and behind its station
+FACING_UP = 0.5  # cosine of the normal's angle to the section's own up
+
+# Rows of the landmark model: the tip, the middles, then left and right of each section.
+TIP = 0
+MIDDLES = slice(1, 1 + len(STATIONS))
+BLADE, FRONT, BODY, BACK = range(1, 1 + len(STATIONS))
+LEFT_HALF, RIGHT_HALF, LEFT_EDGE, RIGHT_EDGE = (
+    slice(1 + len(STATIONS) + i * SECTIONS, 1 + len(STATIONS) + (i + 1) * SECTIONS) for i in range(4)
+)
+
+
+def landmark_model(model: TongueModel) -> TongueModel:
+    """The model at its landmarks alone (`landmark_vertices`)."""
+    return model.at(landmark_vertices(model).tolist())
+
+
+def landmark_vertices(model: TongueModel) -> NDArray[np.intp]:
+    """(17,) vertices: tip; middle of blade, front, body, back; left halfway, right halfway, left edge, right edge of
+    blade, front and body. Found on the mean shape, from the model's mid-sagittal vertices and its landmark `Tip` where
+    it names them. A right landmark is the vertex nearest to the left one's mirror image.
+
+    Raises InputError where there is no surface beside the contour.
+    """
+    vertices = model.mean_vertices()
+    contour = midsagittal_vertices(model)
+    if len(contour) < 2 * len(STATIONS):
+        raise InputError(
+            f"the model '{model.name}' has {len(contour)} mid-sagittal vertices: too few for avatar shapes."
+        )
+    tip = model.marks.landmarks.get("Tip", int(contour[np.argmin(vertices[contour, 1])]))
+    sagittal = vertices[contour, 1:]
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(sagittal, axis=0), axis=1))])
+    places = [int(np.argmin(np.abs(along - part * along[-1]))) for part in STATIONS.values()]
+    middles = [int(contour[place]) for place in places]
+    normals = vertex_normals(vertices, model.faces)
+    sides = []
+    for place in places[:SECTIONS]:
+        before, behind = sagittal[max(place - 3, 0)], sagittal[min(place + 3, len(sagittal) - 1)]
+        sides.append(_section(vertices, normals, int(contour[place]), behind - before, model.name))
+    halves, edges = zip(*sides)
+    mirrored = [
+        [int(np.argmin(np.linalg.norm(vertices - vertices[left] * [-1, 1, 1], axis=1))) for left in row]
+        for row in (halves, edges)
+    ]
+    return np.array([tip, *middles, *halves, *mirrored[0], *edges, *mirrored[1]], dtype=np.intp)
+
+
+def _section(
+    vertices: FloatArray, normals: FloatArray, middle: int, backwards: FloatArray, name: str
+) -> tuple[int, int]:
+    """The vertices halfway to the left edge and at it, in the section through a contour vertex; backwards (2,): the
+    contour's direction there, y and z."""
+    back = np.array([0.0, *backwards]) / np.linalg.norm(backwards)
+    up = np.array([0.0, -back[2], back[1]])
+    from_middle = vertices - vertices[middle]
+    near = (np.abs(from_middle @ back) <= SLICE_MM) & (vertices[:, 0] > 0)
+    facing = near & (normals @ up >= FACING_UP)
+    found = np.flatnonzero(facing if facing.any() else near)
+    if not len(found):
+        raise InputError(
+            f"the model '{name}' has no surface to the left of its vertex {middle}: avatar shapes need the whole tongue."
+        )
+    lateral = vertices[found, 0]
+    half, edge = (int(found[np.argmin(np.abs(lateral - part * lateral.max()))]) for part in (HALFWAY, EDGE))
+    return half, edge
+
+
+# The measurements -------------------------------------------------------------------------------------
+
+
+def axes_of(points: FloatArray) -> FloatArray:
+    """(..., 15) the quantities of `AXES`, of landmarks (..., 17, 3) mm; lengths and places in mm, angles in degrees."""
+    tip, middles = points[..., TIP, :], points[..., MIDDLES, :]
+    left, right = points[..., LEFT_EDGE, :], points[..., RIGHT_EDGE, :]
+    across = left - right  # (..., 3 sections, 3)
+    width = _length(across)
+    unit_across = across / width[..., None]
+    # The line along the tongue at each section, from the landmark behind to the one before it; then up.
+    chain = points[..., [TIP, BLADE, FRONT, BODY, BACK], :]
+    steps = chain[..., :-1, :] - chain[..., 1:, :]  # forwards
+    forwards = steps[..., :-1, :] + steps[..., 1:, :]
+    up = _cross(forwards, unit_across)
+    up /= _length(up)[..., None]
+
+    chord = 0.5 * (left + right)
+    middle_height = _dot(middles[..., :SECTIONS, :] - chord, up)
+    left_half, right_half = points[..., LEFT_HALF, :], points[..., RIGHT_HALF, :]
+    half_height = _dot(0.5 * (left_half + right_half) - chord, up)
+    left_out, right_out = left - left_half, right - right_half
+    sides = np.arctan2(_dot(left_out, up), _dot(left_out, unit_across)) + np.arctan2(
+        _dot(right_out, up), -_dot(right_out, unit_across)
+    )
+
+    body = middles[..., 1:, :].mean(axis=-2)
+    lateral = unit_across[..., BODY - 1, :]
+    hind, fore = points[..., BLADE, :] - points[..., BODY, :], tip - points[..., BLADE, :]
+    curl = np.arctan2(-_dot(_cross(hind, fore), lateral), _dot(hind, fore))
+    blade_across = unit_across[..., 0, :]
+    length_axis = tip - points[..., BODY, :]
+    length_axis = length_axis / _length(length_axis)[..., None]
+    twist = np.arctan2(-_dot(_cross(lateral, blade_across), length_axis), _dot(lateral, blade_across))
+    lean = np.arctan2(-lateral[..., 2], lateral[..., 0])
+    return np.stack(
+        [
+            tip[..., 0],
+            -tip[..., 1],
+            tip[..., 2],
+            body[..., 0],
+            -body[..., 1],
+            body[..., 2],
+            np.degrees(lean),
+            -tip[..., 1],
+            np.degrees(curl),
+            np.degrees(twist),
+            width.mean(axis=-1),
+            _length(steps[..., :SECTIONS, :]).sum(axis=-1),
+            (half_height - middle_height).mean(axis=-1),
+            0.5 * (middle_height + half_height).mean(axis=-1),
+            np.degrees(0.5 * sides.mean(axis=-1)),
+        ],
+        axis=-1,
+    )
+
+
+def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
+    return np.asarray((one * other).sum(axis=-1))
+
+
+def _length(vectors: FloatArray) -> FloatArray:
+    return np.sqrt(_dot(vectors, vectors))
+
+
+def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
+    """As np.cross, which takes several times as long on few vectors."""
+    a, b, c = one[..., 0], one[..., 1], one[..., 2]
+    d, e, f = other[..., 0], other[..., 1], other[..., 2]
+    return np.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=-1)
+
+
+# Ranges -----------------------------------------------------------------------------------------------
+
+
+def default_ranges(model: TongueModel) -> dict[str, tuple[float, float]]:
+    """The ranges of a speaker of whom nothing is known: 0 at the neutral tongue, 1 where the shape is strongest among
+    poses with all weights within mean +- 3 sigma, for the model's mean speaker.
+
+    That pose is the corner of the box to which the quantity's slope at the neutral tongue points; exact for places,
+    which are linear in the weights. `out` is 0 at the incisors.
+    """
+    landmarks = landmark_model(model)
+    speaker = landmarks.for_speaker(model.speaker.mean)
+    reach = SIGMAS * speaker.sigma
+    neutral = axes_of(speaker.vertices(speaker.mean))
+    neutral[_OUT] = 0.0
+    little = 0.01 * np.diag(reach)
+    slopes = np.array(
+        [
+            axes_of(speaker.vertices(speaker.mean + row)) - axes_of(speaker.vertices(speaker.mean - row))
+            for row in little
+        ]
+    )  # (K, axes)
+    ranges = {}
+    for shape, axis in zip(SHAPES, _AXIS_OF_SHAPE, strict=True):
+        corner = speaker.mean + reach * np.sign(shape.sign * slopes[:, axis])
+        strongest = shape.sign * (axes_of(speaker.vertices(corner)) - neutral)[axis]
+        ranges[shape.name] = (0.0, max(float(strongest), LEAST[AXES[axis].unit]))
+    rebased = Rebased.of_range(speaker.mean, speaker.sigma, SIGMAS)
+    for k, (low, high) in enumerate(zip(rebased.low, rebased.high, strict=True)):
+        ranges[f"pose_{k}"] = (float(low), float(high))
+    return ranges
