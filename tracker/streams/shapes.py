@@ -11,11 +11,12 @@ Model frame, mm: x lateral, left positive, y front to back, z up. Left and right
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import atan2, degrees, sqrt
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ... import InputError
 from ...model.mesh import vertex_normals
@@ -153,8 +154,7 @@ class ShapeMeter:
         if self._speaker is None or not np.array_equal(self._speaker, speaker_weights):
             self._speaker = np.array(speaker_weights, dtype=np.float64)
             self._directions = np.tensordot(self._speaker, self._landmarks.core, axes=1)
-            self._neutral = axes_of(self._points(self._landmarks.pose.mean))
-            self._neutral[_OUT] = 0.0
+            self._neutral = _neutral_axes(self._points(self._landmarks.pose.mean))
         axes = axes_of(self._points(weights)) - self._neutral
         return np.concatenate([_SIGN_OF_SHAPE * axes[_AXIS_OF_SHAPE], weights])
 
@@ -163,8 +163,11 @@ class ShapeMeter:
         unit = (self.raw(speaker_weights, weights) - self._low) / self._span
         return np.minimum(np.maximum(unit, 0.0), 1.0)
 
-    def _points(self, weights: FloatArray) -> FloatArray:
-        return np.asarray((self._landmarks.origin + weights @ self._directions).reshape(-1, 3))
+    def _points(self, weights: FloatArray) -> list[list[float]]:
+        points: list[list[float]] = (
+            (self._landmarks.origin + weights @ self._directions).reshape(-1, 3).tolist()
+        )
+        return points
 
 
 def shape_names(directions: int) -> tuple[str, ...]:
@@ -262,104 +265,147 @@ def _section(
 
 # The measurements -------------------------------------------------------------------------------------
 
+# In plain numbers, not in arrays: for three sections of five points NumPy takes several times as long.
+Point = Sequence[float]
 
-def axes_of(points: FloatArray) -> FloatArray:
-    """(..., 15) the quantities of `AXES`, of landmarks (..., 17, 3) mm; lengths and places in mm, angles in degrees."""
-    tip, middles = points[..., TIP, :], points[..., MIDDLES, :]
-    left, right = points[..., LEFT_EDGE, :], points[..., RIGHT_EDGE, :]
-    across = left - right  # (..., 3 sections, 3)
-    width = _length(across)
-    unit_across = across / width[..., None]
-    # The line along the tongue at each section, from the landmark behind to the one before it; then up.
-    chain = points[..., [TIP, BLADE, FRONT, BODY, BACK], :]
-    steps = chain[..., :-1, :] - chain[..., 1:, :]  # forwards
-    forwards = steps[..., :-1, :] + steps[..., 1:, :]
-    up = _cross(forwards, unit_across)
-    up /= _length(up)[..., None]
 
-    chord = 0.5 * (left + right)
-    middle_height = _dot(middles[..., :SECTIONS, :] - chord, up)
-    left_half, right_half = points[..., LEFT_HALF, :], points[..., RIGHT_HALF, :]
-    half_height = _dot(0.5 * (left_half + right_half) - chord, up)
-    left_out, right_out = left - left_half, right - right_half
-    sides = np.arctan2(_dot(left_out, up), _dot(left_out, unit_across)) + np.arctan2(
-        _dot(right_out, up), -_dot(right_out, unit_across)
-    )
-
-    body = middles[..., 1:, :].mean(axis=-2)
-    lateral = unit_across[..., BODY - 1, :]
-    hind, fore = points[..., BLADE, :] - points[..., BODY, :], tip - points[..., BLADE, :]
-    curl = np.arctan2(-_dot(_cross(hind, fore), lateral), _dot(hind, fore))
-    blade_across = unit_across[..., 0, :]
-    length_axis = tip - points[..., BODY, :]
-    length_axis = length_axis / _length(length_axis)[..., None]
-    twist = np.arctan2(-_dot(_cross(lateral, blade_across), length_axis), _dot(lateral, blade_across))
-    lean = np.arctan2(-lateral[..., 2], lateral[..., 0])
-    return np.stack(
+def axes_of(points: Sequence[Point]) -> FloatArray:
+    """(15,) the quantities of `AXES`, of landmarks (17, 3) mm; lengths and places in mm, angles in degrees."""
+    tip = points[TIP]
+    middles, chain = points[MIDDLES], [tip, *points[MIDDLES]]
+    width = groove = dome = sides = length = 0.0
+    across = []
+    for i in range(SECTIONS):
+        left, right = points[LEFT_EDGE][i], points[RIGHT_EDGE][i]
+        left_half, right_half = points[LEFT_HALF][i], points[RIGHT_HALF][i]
+        chord = _minus(left, right)
+        lateral = _unit(chord)
+        up = _unit(
+            _cross(_minus(chain[i], chain[i + 2]), lateral)
+        )  # from the line along the tongue, forwards
+        level = 0.5 * (_dot(left, up) + _dot(right, up))
+        middle_height = _dot(middles[i], up) - level
+        half_height = 0.5 * (_dot(left_half, up) + _dot(right_half, up)) - level
+        left_out, right_out = _minus(left, left_half), _minus(right, right_half)
+        across.append(lateral)
+        width += _dot(chord, lateral)
+        groove += half_height - middle_height
+        dome += 0.5 * (middle_height + half_height)
+        sides += 0.5 * atan2(_dot(left_out, up), _dot(left_out, lateral))
+        sides += 0.5 * atan2(_dot(right_out, up), -_dot(right_out, lateral))
+        length += _norm(_minus(chain[i], chain[i + 1]))
+    blade, body = middles[0], middles[SECTIONS - 1]
+    blade_across, body_across = across[0], across[-1]
+    hind, fore = _minus(blade, body), _minus(tip, blade)
+    curl = atan2(-_dot(_cross(hind, fore), body_across), _dot(hind, fore))
+    along = _unit(_minus(tip, body))
+    twist = atan2(-_dot(_cross(body_across, blade_across), along), _dot(body_across, blade_across))
+    lean = atan2(-body_across[2], body_across[0])
+    behind = [sum(axis) / (len(middles) - 1) for axis in zip(*middles[1:])]
+    return np.array(
         [
-            tip[..., 0],
-            -tip[..., 1],
-            tip[..., 2],
-            body[..., 0],
-            -body[..., 1],
-            body[..., 2],
-            np.degrees(lean),
-            -tip[..., 1],
-            np.degrees(curl),
-            np.degrees(twist),
-            width.mean(axis=-1),
-            _length(steps[..., :SECTIONS, :]).sum(axis=-1),
-            (half_height - middle_height).mean(axis=-1),
-            0.5 * (middle_height + half_height).mean(axis=-1),
-            np.degrees(0.5 * sides.mean(axis=-1)),
-        ],
-        axis=-1,
+            *(tip[0], -tip[1], tip[2]),
+            *(behind[0], -behind[1], behind[2]),
+            *(degrees(lean), -tip[1]),
+            *(degrees(curl), degrees(twist)),
+            *(width / SECTIONS, length),
+            *(groove / SECTIONS, dome / SECTIONS, degrees(sides / SECTIONS)),
+        ]
     )
 
 
-def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
-    return np.asarray((one * other).sum(axis=-1))
+def _minus(one: Point, other: Point) -> Point:
+    return one[0] - other[0], one[1] - other[1], one[2] - other[2]
 
 
-def _length(vectors: FloatArray) -> FloatArray:
-    return np.sqrt(_dot(vectors, vectors))
+def _dot(one: Point, other: Point) -> float:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
-def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
-    """As np.cross, which takes several times as long on few vectors."""
-    a, b, c = one[..., 0], one[..., 1], one[..., 2]
-    d, e, f = other[..., 0], other[..., 1], other[..., 2]
-    return np.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=-1)
+def _cross(one: Point, other: Point) -> Point:
+    (a, b, c), (d, e, f) = one, other
+    return b * f - c * e, c * d - a * f, a * e - b * d
+
+
+def _norm(vector: Point) -> float:
+    return sqrt(_dot(vector, vector))
+
+
+def _unit(vector: Point) -> Point:
+    """Of length 1; zeros stay zeros, so that points on top of each other make no NaN."""
+    norm = _norm(vector) or 1.0
+    return vector[0] / norm, vector[1] / norm, vector[2] / norm
 
 
 # Ranges -----------------------------------------------------------------------------------------------
 
+FEWEST_FRAMES = 50
+STRONGEST = 0.98
+"""The quantile of a speaker's poses at which a shape is 1: a few wrong frames do not set the scale."""
+
+
+def _neutral_axes(points: Sequence[Point]) -> FloatArray:
+    """What the axes are measured against: those of the neutral tongue, but 0, the incisors, for `out`."""
+    axes = axes_of(points)
+    axes[_OUT] = 0.0
+    return axes
+
 
 def default_ranges(model: TongueModel) -> dict[str, tuple[float, float]]:
     """The ranges of a speaker of whom nothing is known: 0 at the neutral tongue, 1 where the shape is strongest among
-    poses with all weights within mean +- 3 sigma, for the model's mean speaker.
+    poses with all weights within mean +- 3 sigma, for the model's mean speaker. `out` is 0 at the incisors; `pose_<k>`
+    is 0 at mean - 3 sigma.
 
     That pose is the corner of the box to which the quantity's slope at the neutral tongue points; exact for places,
-    which are linear in the weights. `out` is 0 at the incisors.
+    which are linear in the weights.
     """
-    landmarks = landmark_model(model)
-    speaker = landmarks.for_speaker(model.speaker.mean)
+    speaker = landmark_model(model).for_speaker(model.speaker.mean)
     reach = SIGMAS * speaker.sigma
-    neutral = axes_of(speaker.vertices(speaker.mean))
-    neutral[_OUT] = 0.0
+
+    def axes_at(weights: FloatArray) -> FloatArray:
+        return axes_of(speaker.vertices(weights).tolist())
+
+    neutral = _neutral_axes(speaker.vertices(speaker.mean).tolist())
     little = 0.01 * np.diag(reach)
     slopes = np.array(
-        [
-            axes_of(speaker.vertices(speaker.mean + row)) - axes_of(speaker.vertices(speaker.mean - row))
-            for row in little
-        ]
+        [axes_at(speaker.mean + row) - axes_at(speaker.mean - row) for row in little]
     )  # (K, axes)
     ranges = {}
     for shape, axis in zip(SHAPES, _AXIS_OF_SHAPE, strict=True):
         corner = speaker.mean + reach * np.sign(shape.sign * slopes[:, axis])
-        strongest = shape.sign * (axes_of(speaker.vertices(corner)) - neutral)[axis]
+        strongest = shape.sign * (axes_at(corner) - neutral)[axis]
         ranges[shape.name] = (0.0, max(float(strongest), LEAST[AXES[axis].unit]))
-    rebased = Rebased.of_range(speaker.mean, speaker.sigma, SIGMAS)
-    for k, (low, high) in enumerate(zip(rebased.low, rebased.high, strict=True)):
-        ranges[f"pose_{k}"] = (float(low), float(high))
+    return ranges | _named(Rebased.of_range(speaker.mean, speaker.sigma, SIGMAS))
+
+
+def _named(rebased: Rebased) -> dict[str, tuple[float, float]]:
+    pairs = zip(rebased.low.tolist(), rebased.high.tolist(), strict=True)
+    return {f"pose_{k}": pair for k, pair in enumerate(pairs)}
+
+
+def speaker_ranges(
+    model: TongueModel, speaker_weights: FloatArray, weights: FloatArray
+) -> dict[str, tuple[float, float]]:
+    """The ranges of one speaker, from tracked poses: raw weights (frames, m) and (frames, K).
+
+    A shape is 0 at the median and 1 at the 98th percentile of what was measured, so both shapes of an axis are 0 in
+    the middle of what this speaker does. `out` is 0 at the incisors all the same. `pose_<k>` goes from the smallest to
+    the largest weight, so that not one of these poses is cut off. No range is narrower than `LEAST`; a weight that
+    never moved keeps its default. Raises InputError for fewer than 50 frames.
+    """
+    if len(weights) < FEWEST_FRAMES:
+        raise InputError(
+            f"{len(weights)} tracked frames are too few for a speaker's ranges; expected {FEWEST_FRAMES} or more, of "
+            "varied speech."
+        )
+    meter = ShapeMeter(model)
+    raw = np.array([meter.raw(*pair) for pair in zip(speaker_weights, weights, strict=True)])
+    middle = np.median(raw, axis=0)
+    strongest = np.quantile(raw, STRONGEST, axis=0)
+    ranges = {}
+    for column, (shape, axis) in enumerate(zip(SHAPES, _AXIS_OF_SHAPE, strict=True)):
+        low = 0.0 if axis == _OUT else float(middle[column])
+        ranges[shape.name] = (low, max(float(strongest[column]), low + LEAST[AXES[axis].unit]))
+    for name, (low, high) in _named(Rebased.of_clip(weights)).items():
+        ranges[name] = (low, high) if low < high else meter.ranges[name]
     return ranges
