@@ -1,0 +1,314 @@
+"""One moment of a scene as a picture: the tongue in three dimensions, the mid-sagittal cut beside it, the weights below.
+
+The tongue's shapes stay on the graphics card (`surface`); what is projected here, in numpy, are the few dozen points
+of the cut, the palate, the coils and their trails. Needs a context of OpenGL 3.3, whoever made it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..pose import CoilState, FloatArray
+from .camera import (
+    Area,
+    Layout,
+    Projection,
+    View,
+    camera_axes,
+    flat_projection,
+    home_view,
+    layout_of,
+    solid_projection,
+)
+from .look import Look
+from .markings import Legend, Markings, Section, Trails
+from .overlay import MarkDrawer, Typeface
+from .scene import Moment, Scene, palate_distance, vertex_uncertainty, weights_covariance
+from .shaders import (
+    CUT_FRAGMENT,
+    CUT_VERTEX,
+    GHOST_FRAGMENT,
+    GROUND_FRAGMENT,
+    INSIDE_FRAGMENT,
+    TEXTURE_WIDTH,
+    TONGUE_FRAGMENT,
+    WHOLE_VERTEX,
+)
+from .surface import Surface, SurfacePrograms, tongue_vertex_array
+
+if TYPE_CHECKING:
+    import moderngl
+
+__all__ = ["Renderer", "View", "home_view"]
+
+NEAR_PALATE_MM = 10.0  # from here on all distances look the same
+LONGEST_TRAIL_S = 10.0
+BROKEN_TRAIL_S = 0.25  # longer without a moment, and a trail does not bridge it
+TRAIL_STEP_S = 0.01
+GRAIN_PX = 128
+HIDDEN = 0.3  # how much is seen of a mark behind the tongue
+
+
+class Renderer:
+    """Draws moments of one scene, in one size, into any framebuffer of its context that has a depth buffer."""
+
+    def __init__(self, context: moderngl.Context, scene: Scene, size: tuple[int, int], look: Look) -> None:
+        self.scene, self.look = scene, look
+        self._context = context
+        self._programs = SurfacePrograms(context, scene.model)
+        followed = np.concatenate([scene.outline.vertices, np.asarray(scene.correspondences, dtype=np.intp)])
+        self._tongue, self._ghost = (Surface(self._programs, followed) for _ in range(2))
+        self._tongue_program, self._tongue_array = tongue_vertex_array(self._programs, TONGUE_FRAGMENT)
+        self._ghost_program, self._ghost_array = tongue_vertex_array(self._programs, GHOST_FRAGMENT)
+        self._ground_program = context.program(WHOLE_VERTEX, fragment_shader=GROUND_FRAGMENT)
+        self._ground_array = context.vertex_array(self._ground_program, [])
+        self._cut_program = context.program(CUT_VERTEX, fragment_shader=CUT_FRAGMENT)
+        self._cut_points = context.buffer(reserve=8 * len(scene.outline.shares), dynamic=True)
+        self._cut_array = context.vertex_array(self._cut_program, [(self._cut_points, "2f", "in_place")])
+        self._inside_program = context.program(WHOLE_VERTEX, fragment_shader=INSIDE_FRAGMENT)
+        self._inside_array = context.vertex_array(self._inside_program, [])
+        self._values = context.texture((TEXTURE_WIDTH, self._programs.rows), 1, dtype="f4")
+        self._values.filter = (context.NEAREST, context.NEAREST)
+        self._grain = context.texture((GRAIN_PX, GRAIN_PX), 4, grain().tobytes())
+        self._drawer = MarkDrawer(context)
+        self._past: deque[tuple[float, FloatArray]] = deque()
+        self._coloured_by: object = None
+        self._most_unknown = 1.0
+        self._typeface: Typeface | None = None
+        self._inside: moderngl.Framebuffer | None = None
+        self._set_constants()
+        self.resize(size)
+
+    def resize(self, size: tuple[int, int]) -> None:
+        """From now on pictures are this large (width, height)."""
+        self.size = (max(1, size[0]), max(1, size[1]))
+        self.layout: Layout = layout_of(self.size, self.look)
+        if self._typeface is None or self._typeface.size_px != self.layout.font_px:
+            if self._typeface is not None:
+                self._typeface.release()
+            self._typeface = Typeface(self._context, self.layout.font_px)
+        self._release_inside()
+        flat = self.layout.flat
+        texture = self._context.texture((flat.width, flat.height), 1, alignment=1)
+        self._inside = self._context.framebuffer([texture])
+        self._ground_program["height"] = float(self.size[1])
+        self._flat_projection = flat_projection(self.scene, flat, 2.2 * self.layout.font_px)
+
+    def remember(self, moment: Moment) -> None:
+        """Lets the coils' trails pass here. `draw` does it itself; for a single picture of a later moment, the
+        moments before it are handed over one by one."""
+        past, now = self._past, moment.time_s
+        if past and not past[-1][0] <= now <= past[-1][0] + BROKEN_TRAIL_S:
+            past.clear()
+        if not past or now >= past[-1][0] + TRAIL_STEP_S:
+            past.append((now, np.array(moment.coils)))
+        while past[0][0] < now - LONGEST_TRAIL_S:
+            past.popleft()
+
+    def draw(self, moment: Moment, view: View, framebuffer: moderngl.Framebuffer) -> None:
+        """Draws the whole picture; the framebuffer is as large as `size` says."""
+        self.remember(moment)
+        self._tongue.show(moment)
+        if view.ghost is not None:
+            self._ghost.show(view.ghost)
+        legend = self._colour(moment, view)
+        solid = solid_projection(view, self.layout.solid)
+        assert self._typeface is not None
+        markings = Markings(self.scene, self.look, self.layout, self._typeface)
+        tongue = self._section(self._tongue)
+        ghost = None if view.ghost is None else self._section(self._ghost)
+        self._fill_inside(tongue.outline)
+
+        context = self._context
+        framebuffer.use()
+        framebuffer.scissor = None
+        framebuffer.viewport = (0, 0, *self.size)
+        framebuffer.depth_mask = True
+        context.disable(context.BLEND | context.CULL_FACE | context.DEPTH_TEST)
+        framebuffer.clear(depth=1.0)
+        self._ground_array.render(vertices=3)
+        self._draw_tongue(framebuffer, view, solid, legend is not None)
+        framebuffer.depth_mask = False
+        trails = self._trails(moment, view)
+        rows = markings.in_space(moment, solid, tongue, trails)
+        self._draw_marks(framebuffer, faint(rows), self.layout.solid)
+        context.enable(context.DEPTH_TEST)
+        self._draw_marks(framebuffer, rows, self.layout.solid)
+        context.disable(context.DEPTH_TEST)
+        self._draw_inside(framebuffer)
+        rows = markings.in_plane(moment, self._flat_projection, tongue, ghost, trails)
+        self._draw_marks(framebuffer, rows, self.layout.flat)
+        rows = markings.around(moment, view, solid, self._flat_projection, legend)
+        self._draw_marks(framebuffer, rows, None)
+        framebuffer.scissor = None
+        framebuffer.depth_mask = True
+
+    def _section(self, tongue: Surface) -> Section:
+        points = tongue.followed()
+        ends = len(self.scene.outline.vertices)
+        return Section(self.scene.outline.points(points[:ends]), points[ends:])
+
+    def _draw_tongue(
+        self, framebuffer: moderngl.Framebuffer, view: View, solid: Projection, by_value: bool
+    ) -> None:
+        context = self._context
+        area = self.layout.solid
+        framebuffer.viewport = self._from_below(area)
+        placed = np.eye(4)
+        placed[:3, :3] = camera_axes(view)
+        placed[:3, 3] = -placed[:3, :3] @ (np.asarray(view.centre) + view.distance_mm * placed[2, :3])
+        for program in (self._tongue_program, self._ghost_program):
+            program["to_clip"].write(np.ascontiguousarray(solid.matrix.T, dtype="f4").tobytes())
+            program["to_camera"].write(np.ascontiguousarray(placed.T, dtype="f4").tobytes())
+        context.enable(context.DEPTH_TEST)
+        self._tongue_program["by_value"] = int(by_value)
+        self._values.use(2)
+        self._grain.use(3)
+        self._draw_surface(self._tongue, self._tongue_array)
+        context.enable(context.BLEND)
+        context.blend_func = context.SRC_ALPHA, context.ONE_MINUS_SRC_ALPHA
+        context.disable(context.DEPTH_TEST)
+        if view.ghost is not None:
+            self._draw_surface(self._ghost, self._ghost_array)
+        framebuffer.viewport = (0, 0, *self.size)
+
+    def _draw_surface(self, tongue: Surface, array: moderngl.VertexArray) -> None:
+        tongue.positions.use(0)
+        tongue.normals.use(1)
+        array.render()
+
+    def _fill_inside(self, outline: FloatArray) -> None:
+        """1 inside the cut, closed by a straight line, 0 outside: every triangle of a fan turns its pixels round, and
+        those inside a polygon are turned an odd number of times."""
+        assert self._inside is not None
+        flat = self.layout.flat
+        points = self._flat_projection.pixels(outline)[:, :2] - (flat.x, flat.y)
+        self._cut_points.write(points.astype("f4").tobytes())
+        context = self._context
+        self._inside.use()
+        self._inside.clear()
+        context.disable(context.DEPTH_TEST | context.CULL_FACE)
+        context.enable(context.BLEND)
+        context.blend_func = context.ONE_MINUS_DST_COLOR, context.ZERO
+        self._cut_program["size"] = (flat.width, flat.height)
+        self._cut_array.render(context.TRIANGLE_FAN)
+
+    def _draw_inside(self, framebuffer: moderngl.Framebuffer) -> None:
+        assert self._inside is not None
+        corner = self._from_below(self.layout.flat)
+        self._inside.color_attachments[0].use(0)
+        self._inside_program["corner"] = corner[:2]
+        framebuffer.viewport = corner
+        self._inside_array.render(vertices=3)
+        framebuffer.viewport = (0, 0, *self.size)
+
+    def _draw_marks(
+        self, framebuffer: moderngl.Framebuffer, rows: NDArray[np.float32], area: Area | None
+    ) -> None:
+        assert self._typeface is not None
+        framebuffer.scissor = None if area is None else self._from_below(area)
+        self._drawer.draw(rows, self.size, self._typeface.atlas)
+
+    def _from_below(self, area: Area) -> tuple[int, int, int, int]:
+        """The area as OpenGL counts: from the lower left corner."""
+        return area.x, self.size[1] - area.y - area.height, area.width, area.height
+
+    def _trails(self, moment: Moment, view: View) -> Trails | None:
+        """Where the coils were within the view's time, the present place at the end; None = nowhere else."""
+        kept = [(time, coils) for time, coils in self._past if time >= moment.time_s - view.trail_s]
+        if view.trail_s <= 0 or len(kept) < 2 or not len(moment.coils):
+            return None
+        ages = (moment.time_s - np.array([time for time, _ in kept])) / view.trail_s
+        return Trails(np.array([*(coils for _, coils in kept[:-1]), moment.coils]), ages)
+
+    def _colour(self, moment: Moment, view: View) -> Legend | None:
+        """Brings the vertices' values up to date; None = the tongue has its own colour."""
+        if view.colour_by == "palate" and self.scene.palate is not None:
+            key: object = ("palate", moment.weights.tobytes(), moment.speaker_weights.tobytes())
+            legend, values = Legend("to the palate", 0.0, NEAR_PALATE_MM), None
+            if key != self._coloured_by:
+                values = palate_distance(self._tongue.vertices(), self.scene.palate) / NEAR_PALATE_MM
+        elif view.colour_by == "uncertainty":
+            seen = tuple(
+                vertex
+                for vertex, coil, state in zip(
+                    self.scene.correspondences, moment.coils, moment.coil_states, strict=True
+                )
+                if state == CoilState.TRUSTED and np.isfinite(coil).all()
+            )
+            key = ("uncertainty", seen, moment.speaker_weights.tobytes())
+            values = None
+            if key != self._coloured_by:
+                speaker = self._tongue.speaker
+                self._most_unknown = float(vertex_uncertainty(speaker, weights_covariance(speaker, ())).max())
+                values = vertex_uncertainty(speaker, weights_covariance(speaker, seen)) / self._most_unknown
+            legend = Legend("one sigma of each vertex", 0.0, self._most_unknown)
+        else:
+            return None
+        if values is not None:
+            clipped = np.where(np.isnan(values), -1.0, np.clip(values, 0.0, 1.0))
+            self._values.write(self._programs.layers(clipped.astype("f4")[None, :, None]).tobytes())
+            self._coloured_by = key
+        return legend
+
+    def _set_constants(self) -> None:
+        look = self.look
+        tongue = self._tongue_program
+        tongue["positions"], tongue["normals"], tongue["values"], tongue["grain"] = 0, 1, 2, 3
+        tongue["tissue"], tongue["inside"] = look.tissue, look.inside
+        tongue["near_colour"], tongue["far_colour"], tongue["unknown"] = look.near, look.far, look.unknown
+        tongue["ambient"] = look.ambient
+        lights = (look.key, look.fill)
+        tongue["light_ways"] = [
+            tuple(np.array(light.direction) / np.linalg.norm(light.direction)) for light in lights
+        ]
+        tongue["light_colours"] = [light.colour for light in lights]
+        ghost = self._ghost_program
+        ghost["positions"], ghost["normals"], ghost["tint"] = 0, 1, look.ghost
+        self._ground_program["top"], self._ground_program["bottom"] = look.background
+        self._inside_program["cut"], self._inside_program["tint"] = 0, look.flat
+
+    def _release_inside(self) -> None:
+        if self._inside is not None:
+            self._inside.color_attachments[0].release()
+            self._inside.release()
+
+    def release(self) -> None:
+        """Gives everything on the graphics card back."""
+        self._release_inside()
+        if self._typeface is not None:
+            self._typeface.release()
+        things = (
+            self._drawer, self._tongue, self._ghost, self._tongue_array, self._ghost_array, self._ground_array,
+            self._cut_array, self._inside_array, self._cut_points, self._values, self._grain, self._tongue_program,
+            self._ghost_program, self._ground_program, self._cut_program, self._inside_program, self._programs,
+        )  # fmt: skip
+        for thing in things:
+            thing.release()
+
+
+def faint(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Marks as they shine through the tongue."""
+    pale = rows.copy()
+    pale[:, 11] *= HIDDEN
+    return pale
+
+
+def grain() -> NDArray[np.uint8]:
+    """(n, n, 4) the surface's unevenness, repeating in both directions: two slopes, a tint, and nothing; 128 = even."""
+    random = np.random.default_rng(1)
+    frequency = np.hypot(*np.meshgrid(*[np.fft.fftfreq(GRAIN_PX) * GRAIN_PX] * 2))
+
+    def noise(around: float) -> FloatArray:
+        spectrum = np.fft.fft2(random.normal(size=(GRAIN_PX, GRAIN_PX)))
+        heights = np.fft.ifft2(spectrum * np.exp(-(((frequency - around) / (0.5 * around)) ** 2))).real
+        return np.asarray(heights / heights.std())
+
+    bumps, tint = noise(22.0), noise(5.0)
+    slopes = [bumps - np.roll(bumps, 1, axis=axis) for axis in (1, 0)]
+    parts = [slope / slope.std() for slope in slopes] + [0.6 * tint + 0.4 * bumps, np.zeros_like(tint)]
+    return np.clip(np.stack(parts, axis=-1) * 36 + 128, 0, 255).astype(np.uint8)

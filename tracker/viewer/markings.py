@@ -1,0 +1,236 @@
+"""What is written and drawn on and around the tongue: coils and their names, residuals, trails, palate, bars, text."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..pose import CoilState, FloatArray, PoseStatus
+from .camera import Area, Layout, Projection, View
+from .look import Colour, Look
+from .overlay import Marks, Typeface
+from .scene import COIL_WORDS, STATUS_WORDS, Moment, Scene
+
+SIGMA_SHOWN = 4.0  # a bar's full height; what is beyond has its number
+SIGMA_MARK = 3.0
+SCALE_MM = 10.0
+
+
+@dataclass(frozen=True)
+class Section:
+    """outline: (s, 3) mm, the cut of a tongue; feet: (n, 3) mm, the vertices that the coils are held to."""
+
+    outline: FloatArray
+    feet: FloatArray
+
+
+@dataclass(frozen=True)
+class Trails:
+    """coils: (t, n, 3) mm, the oldest first, the present at the end; ages: (t,) 1 = about to vanish, 0 = now."""
+
+    coils: FloatArray
+    ages: FloatArray
+
+
+@dataclass(frozen=True)
+class Legend:
+    """What the vertices' colours stand for, from `low` to `high` mm."""
+
+    words: str
+    low: float
+    high: float
+
+
+class Markings:
+    """Makes the rows of marks of one picture."""
+
+    def __init__(self, scene: Scene, look: Look, layout: Layout, typeface: Typeface) -> None:
+        self._scene, self._look, self._layout, self._typeface = scene, look, layout, typeface
+        self._stroke = max(1.0, layout.font_px / 9)
+        self._marks = Marks(typeface)
+
+    def in_space(
+        self, moment: Moment, projection: Projection, tongue: Section, trails: Trails | None
+    ) -> NDArray[np.float32]:
+        """On the tongue in three dimensions, with depths."""
+        if self._scene.palate is not None:
+            points = projection.pixels(self._scene.palate)
+            self._marks.polyline(points, 2 * self._stroke, self._look.palate)
+        self._coils(moment, projection, tongue.feet, trails)
+        return self._marks.taken()
+
+    def in_plane(
+        self,
+        moment: Moment,
+        projection: Projection,
+        tongue: Section,
+        ghost: Section | None,
+        trails: Trails | None,
+    ) -> NDArray[np.float32]:
+        """On the mid-sagittal cut."""
+        look, stroke = self._look, self._stroke
+        if self._scene.palate is not None:
+            self._marks.polyline(projection.pixels(self._scene.palate), 2 * stroke, look.palate)
+        if ghost is not None:
+            self._marks.polyline(projection.pixels(ghost.outline), 1.6 * stroke, look.ghost, 0.9)
+        self._marks.polyline(projection.pixels(tongue.outline), 2 * stroke, look.contour)
+        self._coils(moment, projection, tongue.feet, trails)
+        return self._marks.taken()
+
+    def around(
+        self, moment: Moment, view: View, solid: Projection, flat: Projection, legend: Legend | None
+    ) -> NDArray[np.float32]:
+        """Words, numbers and bars, on top of everything."""
+        for projection in (solid, flat):
+            self._names(moment, projection)
+        self._status(moment, view)
+        if legend is not None:
+            self._legend(legend)
+        self._directions(flat)
+        self._bars(moment)
+        return self._marks.taken()
+
+    def _coils(self, moment: Moment, projection: Projection, feet: FloatArray, trails: Trails | None) -> None:
+        if not len(moment.coils):
+            return
+        marks, look = self._marks, self._look
+        coils = projection.pixels(moment.coils)
+        if trails is not None:
+            count = len(moment.coils)
+            places = projection.pixels(trails.coils.reshape(-1, 3)).reshape(-1, count, 3)
+            fading = 0.75 * (1.0 - trails.ages[1:])
+            for coil in range(count):
+                marks.polyline(places[:, coil], 1.2 * self._stroke, self._colour(coil, moment), fading)
+        sticks = projection.pixels(feet)
+        marks.lines(coils, sticks, 1.2 * self._stroke, look.text)
+        sizes = look.ball_mm * projection.pixels_per_mm(moment.coils)
+        for coil, (place, size) in enumerate(zip(coils, sizes, strict=True)):
+            if np.isfinite(place).all():
+                marks.ball(place, max(3.0, float(size)), self._colour(coil, moment))
+
+    def _colour(self, coil: int, moment: Moment) -> Colour:
+        if moment.coil_states[coil] not in (CoilState.TRUSTED, CoilState.MISSING):
+            return self._look.warning
+        return self._look.coils[coil % len(self._look.coils)]
+
+    def _names(self, moment: Moment, projection: Projection) -> None:
+        """Beside the coils, inside the area, none on top of another."""
+        if not len(moment.coils):
+            return
+        area, typeface, marks = projection.area, self._typeface, self._marks
+        places = projection.pixels(moment.coils)
+        sizes = np.maximum(3.0, self._look.ball_mm * projection.pixels_per_mm(moment.coils))
+        taken: list[tuple[float, float, float]] = []
+        for coil in np.argsort(np.where(np.isnan(places[:, 1]), np.inf, places[:, 1])):
+            x, y, _ = places[coil]
+            if not (np.isfinite(x) and area.holds(x, y)):
+                continue
+            state = COIL_WORDS.get(CoilState(int(moment.coil_states[coil])))
+            name = self._scene.names[coil] + (f" ({state})" if state else "")
+            width = typeface.width(name)
+            left = x + sizes[coil] + 4
+            if left + width > area.x + area.width - 2:
+                left = x - sizes[coil] - 4 - width
+            left = max(left, area.x + 2.0)
+            top = float(np.clip(y - typeface.line_px, area.y, area.y + area.height - typeface.line_px))
+            for other_left, other_right, bottom in taken:
+                if left < other_right and other_left < left + width and top < bottom:
+                    top = bottom
+            taken.append((left, left + width, top + typeface.line_px))
+            self._backed(left, top, name, self._colour(int(coil), moment))
+
+    def _backed(self, x: float, y: float, text: str, colour: Colour) -> None:
+        """Text on a ground of its own, readable on the tongue as well."""
+        width, height = self._typeface.width(text), self._typeface.line_px
+        self._marks.bar(x - 3, y - 1, x + width + 3, y + height - 1, self._look.panel, 0.62)
+        self._marks.text(x, y, text, colour)
+
+    def _status(self, moment: Moment, view: View) -> None:
+        look, typeface, area = self._look, self._typeface, self._layout.solid
+        margin = self._layout.margin
+        width = area.width - 2 * margin
+        missing = [
+            name for name, coil in zip(self._scene.names, moment.coils, strict=False) if np.isnan(coil).any()
+        ]
+        words = [f"{moment.time_s:.2f} s", STATUS_WORDS[PoseStatus(moment.status)]]
+        if np.isfinite(moment.residual_mm):
+            words.append(f"residual {moment.residual_mm:.2f} mm")
+        ok = moment.status == PoseStatus.OK
+        texts = [(self._scene.title, look.text), ("   ".join(words), look.faint_text if ok else look.warning)]
+        if missing:
+            texts.append((f"missing: {', '.join(missing)}", look.warning))
+        texts += [(line, look.faint_text) for line in view.lines]
+        rows = [(row, colour) for text, colour in texts for row in typeface.wrapped(text, width)]
+        room = (area.height - 2 * margin) // typeface.line_px
+        if len(rows) > room:
+            rows = [*rows[: room - 1], (f"... {len(rows) - room + 1} more lines", look.faint_text)]
+        for number, (row, colour) in enumerate(rows):
+            self._marks.text(margin, margin + number * typeface.line_px, row, colour)
+
+    def _legend(self, legend: Legend) -> None:
+        look, typeface, marks, area = self._look, self._typeface, self._marks, self._layout.solid
+        margin, steps = self._layout.margin, 24
+        bottom = area.y + area.height - margin
+        low, high = f"{legend.low:.0f}", f"{legend.high:.1f} mm {legend.words}"
+        marks.text(margin, bottom - typeface.line_px, low, look.text)
+        left = margin + typeface.width(low) + 5
+        right = left + min(0.25 * area.width, area.width - left - typeface.width(high) - margin)
+        for step in range(steps):
+            share = step / (steps - 1)
+            colour = tuple(
+                (1 - share) * near + share * far for near, far in zip(look.near, look.far, strict=True)
+            )
+            x = left + (right - left) * np.array([step, step + 1]) / steps
+            top = bottom - typeface.line_px
+            marks.bar(x[0], top + 2, x[1], top + typeface.size_px, (colour[0], colour[1], colour[2]))
+        marks.text(right + 5, bottom - typeface.line_px, high, look.text)
+
+    def _directions(self, flat: Projection) -> None:
+        look, typeface, marks, area = self._look, self._typeface, self._marks, self._layout.flat
+        bottom = area.y + area.height - typeface.line_px - 2
+        marks.text(area.x + 6, bottom, "front", look.faint_text)
+        back = "back"
+        marks.text(area.x + area.width - 6 - typeface.width(back), bottom, back, look.faint_text)
+        length = SCALE_MM * float(flat.pixels_per_mm(np.zeros((1, 3)))[0])
+        words = f"{SCALE_MM:.0f} mm"
+        left = area.x + 0.5 * (area.width - length)
+        y = area.y + area.height - 5.0
+        ends = np.array([[left, y, -1.0], [left + length, y, -1.0]])
+        tick = np.array([0.0, 4.0, 0.0])
+        marks.lines(ends[:1], ends[1:], 2.0, look.text)
+        marks.lines(ends - tick, ends + tick, 1.0, look.text)
+        marks.text(left + 0.5 * (length - typeface.width(words)), y - typeface.line_px - 3, words, look.text)
+
+    def _bars(self, moment: Moment) -> None:
+        look, typeface, marks, area = self._look, self._typeface, self._marks, self._layout.bars
+        line = typeface.line_px
+        marks.text(area.x + 6, area.y + 2, "pose weights in sigma", look.faint_text)
+        left = area.x + 6 + typeface.width("+3") + 6
+        right, top, bottom = area.x + area.width - 6.0, area.y + line + 6.0, area.y + area.height - line
+        middle, per_sigma = 0.5 * (top + bottom), 0.5 * (bottom - top) / SIGMA_SHOWN
+        for sigma in (SIGMA_MARK, 0.0, -SIGMA_MARK):
+            y = middle - sigma * per_sigma
+            words = f"{sigma:+.0f}" if sigma else "0"
+            marks.text(left - 6 - typeface.width(words), y - 0.6 * typeface.size_px, words, look.faint_text)
+            ends = np.array([[left, y, -1.0], [right, y, -1.0]])
+            marks.polyline(ends, 1.0, look.line)
+        count = len(moment.normalised)
+        step = (right - left) / max(count, 1)
+        every = int(np.ceil(typeface.width(str(count)) * 1.5 / step)) if count else 1
+        half = min(0.32 * step, 1.6 * typeface.size_px)
+        for number, sigma in enumerate(moment.normalised):
+            x = left + (number + 0.5) * step
+            end = middle - float(np.clip(sigma, -SIGMA_SHOWN, SIGMA_SHOWN)) * per_sigma
+            beyond = abs(sigma) > SIGMA_MARK
+            colour = look.warning if beyond else look.bar
+            marks.bar(x - half, min(middle, end), x + half, max(middle, end), colour)
+            if number % every == 0:
+                name = str(number + 1)
+                marks.text(x - 0.5 * typeface.width(name), bottom, name, look.faint_text)
+            value = f"{sigma:+.1f}"
+            if typeface.width(value) < 0.96 * step:
+                above = end - line if sigma >= 0 else end + 1
+                above = float(np.clip(above, top - line * 0.4, bottom - line + 4))
+                marks.text(x - 0.5 * typeface.width(value), above, value, look.text)

@@ -1,0 +1,224 @@
+"""Letters, lines, balls and bars on top of the picture, gathered as rows of numbers and drawn in one go."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ... import InputError
+from ..pose import FloatArray
+from .look import Colour
+from .shaders import MARK_FRAGMENT, MARK_VERTEX
+
+if TYPE_CHECKING:
+    import moderngl
+
+LINE, BALL, LETTER, BAR = range(4)
+COLUMNS = 16
+"""kind, ends (4), depths (2), thickness, colour (4), corners in the atlas (4)."""
+ATLAS_PX = 512
+NEAREST_DEPTH = -1.0
+
+
+class Typeface:
+    """One font in one size, its letters put into an atlas when they are first used."""
+
+    def __init__(self, context: moderngl.Context, size_px: int) -> None:
+        try:
+            from PIL import ImageFont
+        except ImportError as reason:
+            raise InputError(
+                "drawing needs the extra 'viewer': pip install 'tonguetrack[viewer]'."
+            ) from reason
+        self._font: Any = ImageFont.load_default(size_px)
+        self.size_px = size_px
+        self.line_px = round(1.35 * size_px)
+        self.atlas = context.texture((ATLAS_PX, ATLAS_PX), 1, bytes(ATLAS_PX * ATLAS_PX), alignment=1)
+        self._row_px = round(1.5 * size_px)
+        self._free = (1, 1)
+        self._letters: dict[str, tuple[float, ...]] = {}
+        self.row = lru_cache(maxsize=512)(self._row)
+
+    def width(self, text: str) -> float:
+        """How many pixels wide the text is."""
+        return float(sum(self._letter(letter)[0] for letter in plain_letters(text)))
+
+    def wrapped(self, text: str, width_px: float) -> list[str]:
+        """The text in lines of at most this width, broken between words where that is possible."""
+        lines: list[str] = []
+        line = ""
+        for word in text.split():
+            joined = f"{line} {word}" if line else word
+            if self.width(joined) <= width_px:
+                line = joined
+                continue
+            if line:
+                lines.append(line)
+            while self.width(word) > width_px and len(word) > 1:
+                fits = next(
+                    n for n in range(len(word) - 1, 0, -1) if n == 1 or self.width(word[:n]) <= width_px
+                )
+                lines.append(word[:fits])
+                word = word[fits:]
+            line = word
+        return [*lines, line] if line else lines
+
+    def _row(self, text: str) -> NDArray[np.float32]:
+        """(n, COLUMNS) the text's letters in white, its upper left corner at 0, 0."""
+        rows = np.zeros((len(plain_letters(text)), COLUMNS), dtype=np.float32)
+        x = 0.0
+        for row, letter in zip(rows, plain_letters(text), strict=True):
+            advance, width, left, top, right, bottom = self._letter(letter)
+            row[0] = LETTER
+            row[1:5] = x, 0, x + width, self._row_px
+            row[5:7] = NEAREST_DEPTH
+            row[8:12] = 1.0
+            row[12:16] = left, top, right, bottom
+            x += advance
+        return rows
+
+    def _letter(self, letter: str) -> tuple[float, ...]:
+        """Advance and width in pixels, and the corners in the atlas."""
+        if letter not in self._letters:
+            self._letters[letter] = self._drawn(letter)
+        return self._letters[letter]
+
+    def _drawn(self, letter: str) -> tuple[float, ...]:
+        from PIL import Image, ImageDraw
+
+        advance = float(self._font.getlength(letter))
+        width = int(np.ceil(advance)) + 2
+        x, y = self._free
+        if x + width > ATLAS_PX:
+            x, y = 1, y + self._row_px + 1
+        if y + self._row_px > ATLAS_PX:
+            return self._letter("?")  # the atlas is full: far more letters than any alphabet has
+        image = Image.new("L", (width, self._row_px))
+        ImageDraw.Draw(image).text((1, 1), letter, font=self._font, fill=255)
+        self.atlas.write(image.tobytes(), viewport=(x, y, width, self._row_px), alignment=1)
+        self._free = (x + width + 1, y)
+        corners = np.array([x, y, x + width, y + self._row_px]) / ATLAS_PX
+        return (advance, float(width), *corners.tolist())
+
+    def release(self) -> None:
+        self.atlas.release()
+
+
+@lru_cache(maxsize=1024)
+def plain_letters(text: str) -> str:
+    """The text in the letters that Pillow's own font has: accents taken off, anything else as a question mark."""
+    bare = unicodedata.normalize("NFKD", text)
+    letters = (letter for letter in bare if not unicodedata.combining(letter))
+    return "".join(letter if " " <= letter <= "~" else "?" for letter in letters)
+
+
+class Marks:
+    """A list of marks in drawing order. Positions are pixels from the upper left, with a depth where it matters."""
+
+    def __init__(self, typeface: Typeface) -> None:
+        self.typeface = typeface
+        self._parts: list[NDArray[np.float32]] = []
+
+    def lines(
+        self, first: FloatArray, second: FloatArray, thickness: float, colour: Colour, alpha: Any = 1.0
+    ) -> None:
+        """Straight lines from points (n, 3) to points (n, 3): x, y, depth. alpha: one, or (n,). NaN: not drawn."""
+        there = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+        rows = np.zeros((int(there.sum()), COLUMNS), dtype=np.float32)
+        rows[:, 1:3], rows[:, 3:5] = first[there, :2], second[there, :2]
+        rows[:, 5], rows[:, 6] = first[there, 2], second[there, 2]
+        rows[:, 7] = thickness
+        rows[:, 8:11] = colour
+        rows[:, 11] = alpha if np.isscalar(alpha) else np.asarray(alpha)[there]
+        self._parts.append(rows)
+
+    def polyline(self, points: FloatArray, thickness: float, colour: Colour, alpha: Any = 1.0) -> None:
+        """A line through points (n, 3); alpha: one, or (n - 1,)."""
+        self.lines(points[:-1], points[1:], thickness, colour, alpha)
+
+    def ball(self, place: FloatArray, radius: float, colour: Colour, alpha: float = 1.0) -> None:
+        """place: (3,) x, y, depth."""
+        row = np.zeros((1, COLUMNS), dtype=np.float32)
+        row[0, :3] = BALL, place[0], place[1]
+        row[0, 5:7] = place[2]
+        row[0, 7] = radius
+        row[0, 8:12] = *colour, alpha
+        self._parts.append(row)
+
+    def bar(
+        self, left: float, top: float, right: float, bottom: float, colour: Colour, alpha: float = 1.0
+    ) -> None:
+        row = np.zeros((1, COLUMNS), dtype=np.float32)
+        row[0, :5] = BAR, left, top, right, bottom
+        row[0, 5:7] = NEAREST_DEPTH
+        row[0, 8:12] = *colour, alpha
+        self._parts.append(row)
+
+    def text(self, x: float, y: float, text: str, colour: Colour, alpha: float = 1.0) -> None:
+        """One line; x, y: the upper left corner."""
+        rows = self.typeface.row(text).copy()
+        rows[:, [1, 3]] += round(x)
+        rows[:, [2, 4]] += round(y)
+        rows[:, 8:11] = colour
+        rows[:, 11] = alpha
+        self._parts.append(rows)
+
+    def block(self, x: float, y: float, lines: Sequence[str], colour: Colour) -> float:
+        """Lines below each other; returns where the next would stand."""
+        for line in lines:
+            self.text(x, y, line, colour)
+            y += self.typeface.line_px
+        return y
+
+    def taken(self) -> NDArray[np.float32]:
+        """(n, COLUMNS) everything gathered so far, which is forgotten."""
+        rows = np.concatenate(self._parts) if self._parts else np.zeros((0, COLUMNS), dtype=np.float32)
+        self._parts = []
+        return rows
+
+
+class MarkDrawer:
+    """Draws rows of marks with one call."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self._program = context.program(MARK_VERTEX, fragment_shader=MARK_FRAGMENT)
+        self._program["letters"] = 0
+        self._buffer: moderngl.Buffer | None = None
+        self._array: moderngl.VertexArray | None = None
+        self._room = 0
+
+    def draw(self, rows: NDArray[np.float32], size: tuple[int, int], atlas: moderngl.Texture) -> None:
+        """rows: (n, COLUMNS); size: of the picture, pixels."""
+        if not len(rows):
+            return
+        if len(rows) > self._room:
+            self._make_room(2 * len(rows))
+        assert self._buffer is not None and self._array is not None
+        self._buffer.write(np.ascontiguousarray(rows, dtype="f4").tobytes())
+        self._program["size"] = size
+        atlas.use(0)
+        self._array.render(self._context.TRIANGLE_STRIP, vertices=4, instances=len(rows))
+
+    def _make_room(self, rows: int) -> None:
+        self._release_buffer()
+        self._buffer = self._context.buffer(reserve=4 * COLUMNS * rows, dynamic=True)
+        names = ("in_kind", "in_ends", "in_depths", "in_thickness", "in_colour", "in_letter")
+        self._array = self._context.vertex_array(
+            self._program, [(self._buffer, "1f 4f 2f 1f 4f 4f /i", *names)]
+        )
+        self._room = rows
+
+    def _release_buffer(self) -> None:
+        for thing in (self._array, self._buffer):
+            if thing is not None:
+                thing.release()
+
+    def release(self) -> None:
+        self._release_buffer()
+        self._program.release()

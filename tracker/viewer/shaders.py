@@ -1,0 +1,249 @@
+"""The programmes that run on the graphics card, for OpenGL 3.3.
+
+Values of vertices lie in textures TEXTURE_WIDTH wide: vertex v in column v % width, row v / width. Several values of one
+vertex (base and directions, the pairs of its ring) lie `rows` further down each.
+"""
+
+from __future__ import annotations
+
+TEXTURE_WIDTH = 256
+
+WHOLE_VERTEX = """
+#version 330
+void main() {
+    vec2 corner = vec2((gl_VertexID << 1) & 2, gl_VertexID & 2);
+    gl_Position = vec4(corner * 2.0 - 1.0, 0.0, 1.0);
+}
+"""
+
+POSITIONS_FRAGMENT = """
+#version 330
+uniform sampler2D shapes;      // base, then the directions
+uniform sampler2D weights;     // one row: the coefficients
+uniform int rows;
+out vec4 position;
+void main() {
+    ivec2 at = ivec2(gl_FragCoord.xy);
+    vec3 sum = texelFetch(shapes, at, 0).xyz;
+    int count = textureSize(weights, 0).x;
+    for (int k = 0; k < count; k++)
+        sum += texelFetch(weights, ivec2(k, 0), 0).x * texelFetch(shapes, at + ivec2(0, (k + 1) * rows), 0).xyz;
+    position = vec4(sum, 1.0);
+}
+"""
+
+NORMALS_FRAGMENT = """
+#version 330
+uniform sampler2D positions;
+uniform isampler2D ring;       // pairs: the two other corners of each face at the vertex, -1 = no more
+uniform int rows;
+out vec4 normal;
+vec3 place(int vertex) {
+    return texelFetch(positions, ivec2(vertex % WIDTH, vertex / WIDTH), 0).xyz;
+}
+void main() {
+    ivec2 at = ivec2(gl_FragCoord.xy);
+    vec3 here = texelFetch(positions, at, 0).xyz;
+    vec3 sum = vec3(0.0);
+    int most = textureSize(ring, 0).y / rows;
+    for (int j = 0; j < most; j++) {
+        ivec2 pair = texelFetch(ring, at + ivec2(0, j * rows), 0).xy;
+        if (pair.x < 0) break;
+        sum += cross(place(pair.x) - here, place(pair.y) - here);
+    }
+    normal = vec4(sum / max(length(sum), 1e-9), 0.0);
+}
+""".replace("WIDTH", str(TEXTURE_WIDTH))
+
+TONGUE_VERTEX = """
+#version 330
+uniform sampler2D positions;
+uniform sampler2D normals;
+uniform sampler2D values;      // what the vertices are coloured by, 0 to 1, negative = unknown
+uniform mat4 to_clip;
+uniform mat4 to_camera;
+in vec2 in_skin;
+out vec3 place;
+out vec3 normal;
+out vec2 skin;
+out float value;
+void main() {
+    ivec2 at = ivec2(gl_VertexID % WIDTH, gl_VertexID / WIDTH);
+    vec4 here = vec4(texelFetch(positions, at, 0).xyz, 1.0);
+    gl_Position = to_clip * here;
+    place = (to_camera * here).xyz;
+    normal = mat3(to_camera) * texelFetch(normals, at, 0).xyz;
+    value = texelFetch(values, at, 0).x;
+    skin = in_skin;
+}
+""".replace("WIDTH", str(TEXTURE_WIDTH))
+
+# Colours are squared before light is added up and rooted afterwards, near enough to what screens do. Light wraps
+# round the edge of the shadow, red farther than blue, as it does under skin; wet tissue has a sharp and a dull gloss.
+TONGUE_FRAGMENT = """
+#version 330
+uniform sampler2D grain;       // two slopes and a tint
+uniform vec3 tissue;
+uniform vec3 inside;
+uniform vec3 near_colour;
+uniform vec3 far_colour;
+uniform vec3 unknown;
+uniform int by_value;
+uniform vec3 ambient;
+uniform vec3 light_ways[2];
+uniform vec3 light_colours[2];
+in vec3 place;
+in vec3 normal;
+in vec2 skin;
+in float value;
+out vec4 colour;
+const vec3 WRAP = vec3(0.50, 0.26, 0.22);
+void main() {
+    vec3 bumps = texture(grain, skin).xyz - 0.5;
+    vec3 n = normalize(normal);
+    vec3 to_eye = normalize(-place);
+    vec3 body = tissue;
+    float wet = 1.0;
+    if (!gl_FrontFacing) { n = -n; body = inside; wet = 0.3; }
+    else if (by_value == 1) body = value < 0.0 ? unknown : mix(near_colour, far_colour, value);
+    n = normalize(n + vec3(bumps.xy, 0.0) * 0.22 * wet);
+    body *= body * (1.0 + 0.5 * bumps.z);
+    vec3 light = ambient * (0.75 + 0.25 * n.y);
+    float gloss = 0.0;
+    for (int i = 0; i < 2; i++) {
+        float slope = dot(n, light_ways[i]);
+        light += light_colours[i] * max((slope + WRAP) / (1.0 + WRAP), 0.0);
+        float half_slope = max(dot(n, normalize(light_ways[i] + to_eye)), 0.0);
+        float two = half_slope * half_slope, four = two * two, eight = four * four;
+        float sharp = eight * eight * eight * eight;
+        gloss += light_colours[i].g * (0.30 * sharp * sharp + 0.10 * eight);
+    }
+    float grazing = 1.0 - max(dot(n, to_eye), 0.0);
+    vec3 rim = vec3(0.55, 0.20, 0.17) * grazing * grazing * grazing;
+    colour = vec4(sqrt(body * light + wet * (gloss * vec3(1.0, 0.95, 0.92) + 0.55 * rim * light)), 1.0);
+}
+"""
+
+GHOST_FRAGMENT = """
+#version 330
+uniform vec3 tint;
+in vec3 place;
+in vec3 normal;
+out vec4 colour;
+void main() {
+    float facing = abs(dot(normalize(normal), normalize(place)));
+    float edge = 1.0 - facing;
+    colour = vec4(tint, 0.10 + 0.55 * edge * edge);
+}
+"""
+
+GROUND_FRAGMENT = """
+#version 330
+uniform vec3 top;
+uniform vec3 bottom;
+uniform float height;
+out vec4 colour;
+void main() { colour = vec4(mix(bottom, top, gl_FragCoord.y / height), 1.0); }
+"""
+
+CUT_VERTEX = """
+#version 330
+uniform vec2 size;
+in vec2 in_place;              // pixels of the panel
+void main() { gl_Position = vec4(2.0 * in_place.x / size.x - 1.0, 1.0 - 2.0 * in_place.y / size.y, 0.0, 1.0); }
+"""
+
+CUT_FRAGMENT = """
+#version 330
+out vec4 colour;
+void main() { colour = vec4(1.0); }
+"""
+
+INSIDE_FRAGMENT = """
+#version 330
+uniform sampler2D cut;         // 1 inside the outline
+uniform vec2 corner;           // lower left of the panel, pixels from below
+uniform vec3 tint;
+out vec4 colour;
+void main() {
+    vec2 at = (gl_FragCoord.xy - corner) / vec2(textureSize(cut, 0));
+    float inside = texture(cut, at).r;
+    if (inside == 0.0) discard;
+    colour = vec4(tint * (0.72 + 0.34 * at.y), inside);
+}
+"""
+
+# Marks: lines, balls, letters and bars, each a quadrilateral in pixels with edges softened over one pixel.
+MARK_VERTEX = """
+#version 330
+uniform vec2 size;
+in float in_kind;
+in vec4 in_ends;               // two points, pixels from the upper left
+in vec2 in_depths;
+in float in_thickness;         // of a line; radius of a ball
+in vec4 in_colour;
+in vec4 in_letter;             // corners in the atlas
+flat out int kind;
+flat out vec4 ends;
+flat out float thickness;
+flat out vec4 tint;
+out vec2 at;
+out vec2 letter;
+void main() {
+    vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1);
+    vec2 first = in_ends.xy, second = in_ends.zw;
+    kind = int(in_kind);
+    float depth = in_depths.x;
+    if (kind == 0) {
+        float reach = 0.5 * in_thickness + 1.0;
+        vec2 along = second - first;
+        float far = length(along);
+        along = far > 0.0 ? along / far : vec2(1.0, 0.0);
+        vec2 aside = vec2(-along.y, along.x);
+        at = mix(first - along * reach, second + along * reach, corner.x) + aside * reach * (2.0 * corner.y - 1.0);
+        depth = mix(in_depths.x, in_depths.y, corner.x);
+    } else if (kind == 1) {
+        at = first + (in_thickness + 1.0) * (2.0 * corner - 1.0);
+    } else {
+        at = mix(first, second, corner);
+    }
+    letter = mix(in_letter.xy, in_letter.zw, corner);
+    ends = in_ends;
+    thickness = in_thickness;
+    tint = in_colour;
+    gl_Position = vec4(2.0 * at.x / size.x - 1.0, 1.0 - 2.0 * at.y / size.y, depth, 1.0);
+}
+"""
+
+MARK_FRAGMENT = """
+#version 330
+uniform sampler2D letters;
+flat in int kind;
+flat in vec4 ends;
+flat in float thickness;
+flat in vec4 tint;
+in vec2 at;
+in vec2 letter;
+out vec4 colour;
+void main() {
+    if (kind == 2) {
+        colour = vec4(tint.rgb, tint.a * texture(letters, letter).r);
+    } else if (kind == 3) {
+        colour = tint;
+    } else if (kind == 1) {
+        vec2 off = at - ends.xy;
+        float far = length(off);
+        vec2 side = off / max(thickness, 1e-3);
+        float up = sqrt(max(1.0 - dot(side, side), 0.0));
+        float light = 0.45 + 0.6 * max(dot(vec3(side.x, -side.y, up), vec3(-0.42, 0.62, 0.66)), 0.0);
+        vec2 shine = side - vec2(-0.35, -0.42);
+        float gloss = 0.7 * max(1.0 - 7.0 * dot(shine, shine), 0.0);
+        colour = vec4(tint.rgb * light + gloss, tint.a * clamp(thickness + 0.5 - far, 0.0, 1.0));
+    } else {
+        vec2 along = ends.zw - ends.xy;
+        float share = clamp(dot(at - ends.xy, along) / max(dot(along, along), 1e-6), 0.0, 1.0);
+        float far = length(at - ends.xy - share * along);
+        colour = vec4(tint.rgb, tint.a * clamp(0.5 * thickness + 0.5 - far, 0.0, 1.0));
+    }
+}
+"""

@@ -1,0 +1,159 @@
+"""A tongue on the graphics card: its shapes go up once for a speaker, afterwards only the weights of each pose."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.mesh import IndexArray
+from ...model.multilinear import SpeakerModel, TongueModel
+from ..pose import FloatArray
+from .scene import Moment
+from .shaders import (
+    NORMALS_FRAGMENT,
+    POSITIONS_FRAGMENT,
+    TEXTURE_WIDTH,
+    TONGUE_VERTEX,
+    WHOLE_VERTEX,
+)
+
+if TYPE_CHECKING:
+    import moderngl
+
+
+class SurfacePrograms:
+    """What all surfaces of one model share: programmes, faces, and which faces surround each vertex."""
+
+    def __init__(self, context: moderngl.Context, model: TongueModel) -> None:
+        self.context = context
+        self.model = model
+        self.rows = -(-model.vertex_count // TEXTURE_WIDTH)
+        self.positions = context.program(WHOLE_VERTEX, fragment_shader=POSITIONS_FRAGMENT)
+        self.normals = context.program(WHOLE_VERTEX, fragment_shader=NORMALS_FRAGMENT)
+        pairs = ring_pairs(model.faces, model.vertex_count)
+        self.ring = context.texture(
+            (TEXTURE_WIDTH, self.rows * len(pairs)), 2, self.layers(pairs, fill=-1).tobytes(), dtype="i4"
+        )
+        self.faces = context.buffer(np.ascontiguousarray(model.faces, dtype="i4").tobytes())
+        rest = model.mean_vertices()
+        # Grain lies on the surface as on a sheet unrolled from tip to root.
+        skin = np.column_stack([rest[:, 0], rest[:, 1] - rest[:, 2]]) / GRAIN_MM
+        self.skin = context.buffer(skin.astype("f4").tobytes())
+        for program in (self.positions, self.normals):
+            program["rows"] = self.rows
+        self.positions["shapes"], self.positions["weights"] = 0, 1
+        self.normals["positions"], self.normals["ring"] = 0, 1
+
+    def layers(self, values: NDArray[np.generic], fill: float = 0) -> NDArray[np.generic]:
+        """(n * rows, width, c) as it lies in a texture, from values (n, V, c)."""
+        count, vertices, parts = values.shape
+        spread = np.full((count, self.rows * TEXTURE_WIDTH, parts), fill, dtype=values.dtype)
+        spread[:, :vertices] = values
+        return spread.reshape(count * self.rows, TEXTURE_WIDTH, parts)
+
+    def release(self) -> None:
+        for thing in (self.positions, self.normals, self.ring, self.faces, self.skin):
+            thing.release()
+
+
+GRAIN_MM = 26.0
+"""So far apart the grain of the surface repeats."""
+
+
+class Surface:
+    """One tongue: positions (V, 3) and normals (V, 3) in textures, made there from the weights of a moment."""
+
+    def __init__(self, programs: SurfacePrograms, followed: NDArray[np.intp]) -> None:
+        """followed: vertices whose positions are wanted here as well."""
+        context = programs.context
+        self._followed_vertices = followed
+        size = (TEXTURE_WIDTH, programs.rows)
+        self.positions = context.texture(size, 4, dtype="f4")
+        self.normals = context.texture(size, 4, dtype="f4")
+        self._targets = [context.framebuffer([texture]) for texture in (self.positions, self.normals)]
+        self._passes = [
+            context.vertex_array(program, []) for program in (programs.positions, programs.normals)
+        ]
+        self._programs = programs
+        self._shapes: moderngl.Texture | None = None
+        self._weights: moderngl.Texture | None = None
+        self._shown = np.zeros(0)
+        self.speaker = programs.model.for_speaker(programs.model.speaker.mean)
+        self._upload(self.speaker)
+
+    def show(self, moment: Moment) -> None:
+        """Brings the tongue into the moment's pose."""
+        if not np.array_equal(moment.speaker_weights, self.speaker.speaker_weights):
+            self._upload(self._programs.model.for_speaker(moment.speaker_weights))
+        if np.array_equal(moment.weights, self._shown):
+            return
+        assert self._shapes is not None and self._weights is not None
+        context, programs = self._programs.context, self._programs
+        self._weights.write(np.asarray(moment.weights, dtype="f4").tobytes())
+        context.disable(context.DEPTH_TEST | context.BLEND | context.CULL_FACE)
+        for target, way, textures in (
+            (self._targets[0], self._passes[0], (self._shapes, self._weights)),
+            (self._targets[1], self._passes[1], (self.positions, programs.ring)),
+        ):
+            target.use()
+            textures[0].use(0)
+            textures[1].use(1)
+            way.render(vertices=3)
+        self._shown = np.array(moment.weights)
+
+    def vertices(self) -> FloatArray:
+        """(V, 3) mm, computed here, not read back."""
+        return self.speaker.vertices(self._shown)
+
+    def followed(self) -> FloatArray:
+        """(f, 3) mm, of the followed vertices alone."""
+        return self._followed_model.vertices(self._shown)
+
+    def _upload(self, speaker: SpeakerModel) -> None:
+        programs, context = self._programs, self._programs.context
+        shapes = np.concatenate([speaker.base[None], speaker.directions]).reshape(-1, speaker.vertex_count, 3)
+        values = programs.layers(np.pad(shapes, ((0, 0), (0, 0), (0, 1))).astype("f4"))
+        if self._shapes is None:
+            count = len(speaker.directions)
+            self._shapes = context.texture((TEXTURE_WIDTH, len(values)), 4, dtype="f4")
+            self._weights = context.texture((count, 1), 1, dtype="f4", alignment=1)
+            for texture in (self._shapes, self._weights, self.positions, self.normals):
+                texture.filter = (context.NEAREST, context.NEAREST)
+        self._shapes.write(values.tobytes())
+        self.speaker = speaker
+        self._followed_model = speaker.at(self._followed_vertices)
+        self._shown = np.zeros(0)
+
+    def release(self) -> None:
+        for thing in (*self._passes, *self._targets, self.positions, self.normals):
+            thing.release()
+        for texture in (self._shapes, self._weights):
+            if texture is not None:
+                texture.release()
+
+
+def tongue_vertex_array(
+    programs: SurfacePrograms, fragment_shader: str
+) -> tuple[moderngl.Program, moderngl.VertexArray]:
+    """A programme that draws a surface with this fragment shader, and the faces it draws."""
+    context = programs.context
+    program = context.program(TONGUE_VERTEX, fragment_shader=fragment_shader)
+    parts = [(programs.skin, "2f", "in_skin")] if "in_skin" in program else []
+    return program, context.vertex_array(program, parts, index_buffer=programs.faces, index_element_size=4)
+
+
+def ring_pairs(faces: IndexArray, vertex_count: int) -> NDArray[np.int32]:
+    """(r, V, 2) the two other corners of each face at each vertex, in the face's order, -1 = it has no more.
+
+    faces: (f, 3); r: the most faces that meet in one vertex, at least 1.
+    """
+    corners = faces.ravel()
+    others = np.stack([np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=-1).reshape(-1, 2)
+    order = np.argsort(corners, kind="stable")
+    counts = np.bincount(corners, minlength=vertex_count)
+    place = np.arange(len(corners)) - np.repeat(np.cumsum(counts) - counts, counts)
+    pairs = np.full((max(1, int(counts.max(initial=0))), vertex_count, 2), -1, dtype=np.int32)
+    pairs[place, corners[order]] = others[order]
+    return pairs
