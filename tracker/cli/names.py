@@ -12,6 +12,7 @@ from ... import InputError
 
 if TYPE_CHECKING:
     from ...model.multilinear import TongueModel
+    from ..pose import TrackedPoses
 
 BUNDLED = "bundled"
 
@@ -25,6 +26,29 @@ def named_model(name: str) -> TongueModel:
     from ...model.files import load_model
 
     return load_model(name)
+
+
+def poses_and_model(path: str, model_name: str | None = None) -> tuple[TrackedPoses, TongueModel]:
+    """Tracked poses and the model that they belong to: the one of this name, else the one that the file names."""
+    from ..posefiles import read_poses
+
+    given = named_model(model_name) if model_name else None
+    poses = read_poses(path, given)
+    model = given or _model_of(poses, path)
+    if poses.model_fingerprint and poses.model_fingerprint != model.fingerprint:
+        raise InputError(
+            f"{path}: the poses were tracked with the model {poses.model_name} [{poses.model_fingerprint}], "
+            f"but {model.name} is [{model.fingerprint}]; name the right one with --model."
+        )
+    return poses, model
+
+
+def _model_of(poses: TrackedPoses, path: str) -> TongueModel:
+    if not poses.model_path:
+        raise InputError(f"{path}: it does not say which model it belongs to; name it with --model.")
+    if poses.model_path != BUNDLED and not Path(poses.model_path).is_file():
+        raise InputError(f"{path}: its model {poses.model_path} is not there any more; name it with --model.")
+    return named_model(poses.model_path)
 
 
 def as_text(name: str) -> str:

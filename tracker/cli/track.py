@@ -13,7 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ... import InputError
-from .names import BUNDLED, add_recording_flags, keep_apart, named_model, parsed_coils, prepare_folder
+from .names import (
+    BUNDLED,
+    add_recording_flags,
+    keep_apart,
+    named_model,
+    parsed_coils,
+    poses_and_model,
+    prepare_folder,
+)
 
 if TYPE_CHECKING:
     from ...drivers.frames import Recording
@@ -331,21 +339,13 @@ def _with_progress(jobs: list[Job]) -> Any:
 def run_mesh(args: argparse.Namespace) -> int:
     from ...atomic import write_atomically
     from ...model.mesh import MESH_SUFFIXES, Mesh, mesh_bytes
-    from ..posefiles import read_poses
 
     target = Path(args.output)
     if target.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(
             f"{target}: meshes are written as {' or '.join(MESH_SUFFIXES)}; end the name in one of them."
         )
-    given = named_model(args.model) if args.model else None
-    poses = read_poses(args.poses, given)
-    model = given or _model_of(poses, Path(args.poses))
-    if poses.model_fingerprint and poses.model_fingerprint != model.fingerprint:
-        raise InputError(
-            f"{args.poses}: the poses were tracked with the model {poses.model_name} [{poses.model_fingerprint}], "
-            f"but {model.name} is [{model.fingerprint}]; name the right one with --model."
-        )
+    poses, model = poses_and_model(args.poses, args.model)
     if args.frame is not None:
         if not 0 <= args.frame < poses.frame_count:
             raise InputError(
@@ -364,13 +364,3 @@ def run_mesh(args: argparse.Namespace) -> int:
     written = str(target) if args.frame is not None else f"{len(frames)} meshes beside {target}"
     print(f"written: {written} ({model.name}, {model.vertex_count} vertices, mm)", file=sys.stderr)
     return 0
-
-
-def _model_of(poses: TrackedPoses, source: Path) -> TongueModel:
-    if not poses.model_path:
-        raise InputError(f"{source}: it does not say which model it belongs to; name it with --model.")
-    if poses.model_path != BUNDLED and not Path(poses.model_path).is_file():
-        raise InputError(
-            f"{source}: its model {poses.model_path} is not there any more; name it with --model."
-        )
-    return named_model(poses.model_path)
