@@ -61,6 +61,7 @@ from .smoothing import NO_SMOOTHING, Smoothing, smoothing_from_toml, smoothing_t
 MAX_SESSION_BYTES = 1024 * 1024
 LARGEST_TERM = 1e12  # of the energy's weights: beyond, float64 loses the other terms
 NO_SESSION = "no session file"
+SHAPES_COMMENT = "avatar shape = what makes it 0 and what makes it 1: mm, degrees, or raw weight"
 _ENDLESS_KEY = re.compile(r"^(?:[^.=\n]*\.){1000}", re.MULTILINE)
 """For a key of many parts tomllib's work grows with the square of their number."""
 
@@ -205,9 +206,22 @@ def session_toml(session: Session) -> str:
         _add_table(document, "speaker", "raw weights of the anatomy", speaker)
     if session.shape_ranges:
         ranges = {name: list(pair) for name, pair in session.shape_ranges.items()}
-        _add_table(document, "shapes", "avatar shape = what makes it 0 and 1: mm, degrees, or raw weight", ranges)
+        _add_table(document, "shapes", SHAPES_COMMENT, ranges)
     energy = {name: getattr(session.energy, name) for name in Energy.__dataclass_fields__}
     _add_table(document, "energy", "weights of the terms; box in sigma", energy)
+    return tomlkit.dumps(document)
+
+
+def with_shape_ranges(text: str, ranges: Mapping[str, tuple[float, float]]) -> str:
+    """The text of a session file with these ranges as its table [shapes]; everything else, comments too, as it was."""
+    import tomlkit
+
+    document = tomlkit.parse(text)
+    table = tomlkit.table()
+    table.comment(SHAPES_COMMENT)
+    for name, pair in ranges.items():
+        table.add(name, list(pair))
+    document["shapes"] = table
     return tomlkit.dumps(document)
 
 

@@ -27,6 +27,7 @@ def build_parser() -> argparse.ArgumentParser:
         live,
         model,
         monitor,
+        shapes,
         simulate,
         take,
         track,
@@ -40,7 +41,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for family in (
         demo, live, track, calibrate, anatomy, files, take, devices, doctor, model, evaluate, experiment, simulate,
-        monitor, bench,
+        monitor, shapes, bench,
     ):  # fmt: skip
         family.add_commands(commands)
     return parser

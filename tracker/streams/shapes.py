@@ -33,94 +33,85 @@ LEAST = {"mm": 2.0, "deg": 5.0}
 
 @dataclass(frozen=True)
 class Axis:
-    """A measured quantity. unit: mm or deg; meaning: what makes it grow; rigid: whether it stays as it is when the
-    whole tongue is turned and shifted."""
+    """A measured quantity. unit: mm or deg; rigid: whether it stays as it is when the whole tongue is turned and
+    shifted. `axes_of` says how each is measured."""
 
     name: str
     unit: str
-    meaning: str
     rigid: bool = False
 
 
 AXES = (
-    Axis("tip x", "mm", "the tip goes to the left"),
-    Axis("tip y", "mm", "the tip goes to the front"),
-    Axis("tip z", "mm", "the tip goes up"),
-    Axis("body x", "mm", "the middle of front, body and back goes to the left"),
-    Axis("body y", "mm", "the middle of front, body and back goes to the front"),
-    Axis("body z", "mm", "the middle of front, body and back goes up"),
-    Axis("lean", "deg", "the body turns about its length: left edge down, right edge up"),
-    Axis(
-        "out", "mm", "the tip is in front of the upper incisors' edge, y = 0; not against the neutral tongue"
-    ),
-    Axis("curl", "deg", "the line from blade to tip turns up against the line from body to blade", True),
-    Axis("twist", "deg", "the blade turns about the tongue's length against the body: left edge down", True),
-    Axis("width", "mm", "the edges go apart; mean of blade, front and body", True),
-    Axis("length", "mm", "tip, blade, front and body go apart, summed along the middle", True),
-    Axis(
-        "groove",
-        "mm",
-        "the middle sinks below the points halfway to the edges; mean of blade, front, body",
-        True,
-    ),
-    Axis(
-        "dome",
-        "mm",
-        "middle and halfway points rise above the line between the edges; mean of the same",
-        True,
-    ),
-    Axis(
-        "sides", "deg", "the outer halves turn up against the line between the edges; mean of the same", True
-    ),
+    Axis("tip x", "mm"),
+    Axis("tip y", "mm"),
+    Axis("tip z", "mm"),
+    Axis("body x", "mm"),
+    Axis("body y", "mm"),
+    Axis("body z", "mm"),
+    Axis("lean", "deg"),
+    Axis("out", "mm"),
+    Axis("curl", "deg", rigid=True),
+    Axis("twist", "deg", rigid=True),
+    Axis("width", "mm", rigid=True),
+    Axis("length", "mm", rigid=True),
+    Axis("groove", "mm", rigid=True),
+    Axis("dome", "mm", rigid=True),
+    Axis("sides", "deg", rigid=True),
 )
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A named shape: the part of an axis with this sign."""
+    """A named shape: what an axis says with this sign. A range of it is (value for 0, value for 1) of sign x axis."""
 
     name: str
     axis: str
     sign: int
+    meaning: str
 
 
 SHAPES = (
-    Shape("tip_forward", "tip y", 1),
-    Shape("tip_back", "tip y", -1),
-    Shape("tip_up", "tip z", 1),
-    Shape("tip_down", "tip z", -1),
-    Shape("tip_left", "tip x", 1),
-    Shape("tip_right", "tip x", -1),
-    Shape("curl_up", "curl", 1),
-    Shape("bend_down", "curl", -1),
-    Shape("body_up", "body z", 1),
-    Shape("body_down", "body z", -1),
-    Shape("body_front", "body y", 1),
-    Shape("body_back", "body y", -1),
-    Shape("body_left", "body x", 1),
-    Shape("body_right", "body x", -1),
-    Shape("wide", "width", 1),
-    Shape("narrow", "width", -1),
-    Shape("long", "length", 1),
-    Shape("short", "length", -1),
-    Shape("groove", "groove", 1),
-    Shape("ridge", "groove", -1),
-    Shape("arched", "dome", 1),
-    Shape("flat", "dome", -1),
-    Shape("roll", "sides", 1),
-    Shape("twist_left", "twist", 1),
-    Shape("twist_right", "twist", -1),
-    Shape("lean_left", "lean", 1),
-    Shape("lean_right", "lean", -1),
-    Shape("out", "out", 1),
+    Shape("tip_forward", "tip y", 1, "the tip goes to the front"),
+    Shape("tip_back", "tip y", -1, "the tip goes to the back"),
+    Shape("tip_up", "tip z", 1, "the tip goes up"),
+    Shape("tip_down", "tip z", -1, "the tip goes down"),
+    Shape("tip_left", "tip x", 1, "the tip goes to the left"),
+    Shape("tip_right", "tip x", -1, "the tip goes to the right"),
+    Shape("curl_up", "curl", 1, "the part from blade to tip turns up against the part from body to blade"),
+    Shape(
+        "bend_down", "curl", -1, "the part from blade to tip turns down against the part from body to blade"
+    ),
+    Shape("body_up", "body z", 1, "the middle of front, body and back goes up"),
+    Shape("body_down", "body z", -1, "the middle of front, body and back goes down"),
+    Shape("body_front", "body y", 1, "the middle of front, body and back goes to the front"),
+    Shape("body_back", "body y", -1, "the middle of front, body and back goes to the back"),
+    Shape("body_left", "body x", 1, "the middle of front, body and back goes to the left"),
+    Shape("body_right", "body x", -1, "the middle of front, body and back goes to the right"),
+    Shape("wide", "width", 1, "the edges go apart"),
+    Shape("narrow", "width", -1, "the edges come together"),
+    Shape("long", "length", 1, "the way from tip to body along the middle gets longer"),
+    Shape("short", "length", -1, "the way from tip to body along the middle gets shorter"),
+    Shape("groove", "groove", 1, "the middle sinks between the points halfway to the edges"),
+    Shape("ridge", "groove", -1, "the middle rises between the points halfway to the edges"),
+    Shape("arched", "dome", 1, "the surface rises above the line from edge to edge"),
+    Shape("flat", "dome", -1, "the surface comes down to the line from edge to edge"),
+    Shape("roll", "sides", 1, "both sides turn up"),
+    Shape(
+        "twist_left", "twist", 1, "the blade turns against the body: its left edge down, its right edge up"
+    ),
+    Shape(
+        "twist_right", "twist", -1, "the blade turns against the body: its right edge down, its left edge up"
+    ),
+    Shape("lean_left", "lean", 1, "the body turns about its length: left edge down, right edge up"),
+    Shape("lean_right", "lean", -1, "the body turns about its length: right edge down, left edge up"),
+    Shape("out", "out", 1, "the tip is in front of the upper incisors' edge, y = 0"),
 )
-"""A range of such a shape is (value for 0, value for 1) of sign x axis."""
 
-_AXIS_OF_SHAPE = np.array([[axis.name for axis in AXES].index(shape.axis) for shape in SHAPES])
+_AXIS_NAMES = [axis.name for axis in AXES]
+_OUT = _AXIS_NAMES.index("out")
+_AXIS_OF_SHAPE = np.array([_AXIS_NAMES.index(shape.axis) for shape in SHAPES])
 _SIGN_OF_SHAPE = np.array([float(shape.sign) for shape in SHAPES])
-_UNIT_OF_SHAPE = [AXES[axis].unit for axis in _AXIS_OF_SHAPE]
-
-_OUT = [axis.name for axis in AXES].index("out")
+_UNIT_OF_SHAPE = tuple(AXES[axis].unit for axis in _AXIS_OF_SHAPE)
 
 
 class ShapeMeter:
@@ -134,7 +125,7 @@ class ShapeMeter:
     def __init__(self, model: TongueModel, ranges: Mapping[str, tuple[float, float]] | None = None) -> None:
         self._landmarks = landmark_model(model)
         self.names = shape_names(model.pose.size)
-        self.units = (*_UNIT_OF_SHAPE, *["raw"] * model.pose.size)
+        self.units = (*_UNIT_OF_SHAPE, *("raw" for _ in range(model.pose.size)))
         merged = default_ranges(model) | checked_ranges(ranges or {}, self.names)
         self.ranges = {name: merged[name] for name in self.names}
         self._low = np.array([low for low, _ in self.ranges.values()])
@@ -265,12 +256,18 @@ def _section(
 
 # The measurements -------------------------------------------------------------------------------------
 
-# In plain numbers, not in arrays: for three sections of five points NumPy takes several times as long.
+# In plain numbers, not in arrays: for three sections of five points NumPy takes five times as long.
 Point = Sequence[float]
 
 
 def axes_of(points: Sequence[Point]) -> FloatArray:
-    """(15,) the quantities of `AXES`, of landmarks (17, 3) mm; lengths and places in mm, angles in degrees."""
+    """(15,) the quantities of `AXES`, of landmarks (17, 3) mm; lengths and places in mm, angles in degrees.
+
+    A section's `lateral` is the direction from its right edge to its left one; its `up` is at right angles to that and
+    to the line from the landmark behind it to the one before it. Heights are along `up`, above the line between the
+    edges. Width, groove (halfway points above the middle), dome (mean height of middle and halfway points) and sides
+    (how far the way from a halfway point to its edge turns up) are means of blade, front and body.
+    """
     tip = points[TIP]
     middles, chain = points[MIDDLES], [tip, *points[MIDDLES]]
     width = groove = dome = sides = length = 0.0
@@ -389,9 +386,10 @@ def speaker_ranges(
     """The ranges of one speaker, from tracked poses: raw weights (frames, m) and (frames, K).
 
     A shape is 0 at the median and 1 at the 98th percentile of what was measured, so both shapes of an axis are 0 in
-    the middle of what this speaker does. `out` is 0 at the incisors all the same. `pose_<k>` goes from the smallest to
-    the largest weight, so that not one of these poses is cut off. No range is narrower than `LEAST`; a weight that
-    never moved keeps its default. Raises InputError for fewer than 50 frames.
+    the middle of what this speaker does, to a thousandth; no range is narrower than `LEAST`. `out` is 0 at the incisors
+    all the same, and keeps its default as long as the tongue stayed behind them. `pose_<k>` goes from the smallest to
+    the largest weight, so that not one of these poses is cut off; a weight that never moved keeps its default. Raises
+    InputError for fewer than 50 frames.
     """
     if len(weights) < FEWEST_FRAMES:
         raise InputError(
@@ -399,13 +397,15 @@ def speaker_ranges(
             "varied speech."
         )
     meter = ShapeMeter(model)
-    raw = np.array([meter.raw(*pair) for pair in zip(speaker_weights, weights, strict=True)])
-    middle = np.median(raw, axis=0)
-    strongest = np.quantile(raw, STRONGEST, axis=0)
-    ranges = {}
-    for column, (shape, axis) in enumerate(zip(SHAPES, _AXIS_OF_SHAPE, strict=True)):
-        low = 0.0 if axis == _OUT else float(middle[column])
-        ranges[shape.name] = (low, max(float(strongest[column]), low + LEAST[AXES[axis].unit]))
-    for name, (low, high) in _named(Rebased.of_clip(weights)).items():
-        ranges[name] = (low, high) if low < high else meter.ranges[name]
-    return ranges
+    raw = np.array([meter.raw(*frame) for frame in zip(speaker_weights, weights, strict=True)])
+    middles = np.median(raw, axis=0).tolist()
+    tops = np.quantile(raw, STRONGEST, axis=0).tolist()
+    ranges = dict(meter.ranges)
+    for shape, axis, middle, top in zip(SHAPES, _AXIS_OF_SHAPE, middles, tops):
+        least = LEAST[AXES[axis].unit]
+        if axis != _OUT:
+            ranges[shape.name] = (round(middle, 3), round(max(top, middle + least), 3))
+        elif top >= least:
+            ranges[shape.name] = (0.0, round(top, 3))
+    moved = {name: pair for name, pair in _named(Rebased.of_clip(weights)).items() if pair[0] < pair[1]}
+    return ranges | moved
