@@ -198,6 +198,19 @@ LEFT_HALF, RIGHT_HALF, LEFT_EDGE, RIGHT_EDGE = (
 )
 
 
+def contour_with_parts(model: TongueModel) -> tuple[NDArray[np.intp], FloatArray]:
+    """(c,) the mid-sagittal vertices from tip to root, and (c,) the part of the contour's length, 0..1, at which each
+    lies on the mean shape. InputError where there are too few to tell regions apart."""
+    contour = midsagittal_vertices(model)
+    if len(contour) < 2 * len(STATIONS):
+        raise InputError(
+            f"the model '{model.name}' has {len(contour)} mid-sagittal vertices: too few to tell the tongue's parts."
+        )
+    steps = np.diff(model.mean_vertices()[contour, 1:], axis=0)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
+    return contour, along / along[-1]
+
+
 def landmark_model(model: TongueModel) -> TongueModel:
     """The model at its landmarks alone (`landmark_vertices`)."""
     return model.at(landmark_vertices(model).tolist())
@@ -211,15 +224,10 @@ def landmark_vertices(model: TongueModel) -> NDArray[np.intp]:
     Raises InputError where there is no surface beside the contour.
     """
     vertices = model.mean_vertices()
-    contour = midsagittal_vertices(model)
-    if len(contour) < 2 * len(STATIONS):
-        raise InputError(
-            f"the model '{model.name}' has {len(contour)} mid-sagittal vertices: too few for avatar shapes."
-        )
-    tip = model.marks.landmarks.get("Tip", int(contour[np.argmin(vertices[contour, 1])]))
+    contour, parts = contour_with_parts(model)
     sagittal = vertices[contour, 1:]
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(sagittal, axis=0), axis=1))])
-    places = [int(np.argmin(np.abs(along - part * along[-1]))) for part in STATIONS.values()]
+    tip = model.marks.landmarks.get("Tip", int(contour[np.argmin(sagittal[:, 0])]))
+    places = [int(np.argmin(np.abs(parts - part))) for part in STATIONS.values()]
     middles = [int(contour[place]) for place in places]
     normals = vertex_normals(vertices, model.faces)
     sides = []
