@@ -339,6 +339,6 @@ def test_parsers_of_the_three_commands_stand_alone():
     commands = parser.add_subparsers(required=True)
     for family in (demo, monitor, bench):
         family.add_commands(commands)
-    assert parser.parse_args(["demo", "--fast"]).osc == "127.0.0.1:9000"
+    assert parser.parse_args(["demo", "--fast"]).fast
     assert parser.parse_args(["monitor"]).listen == "127.0.0.1:9000"
     assert parser.parse_args(["bench"]).model is None

@@ -335,6 +335,9 @@ def _new_map(path: Path, layout: _Layout) -> mmap.mmap:
             file.write(layout.header().ljust(layout.file_bytes, b"\0"))
             file.flush()
             made = mmap.mmap(file.fileno(), layout.file_bytes)
+        path.chmod(
+            0o400
+        )  # nobody writes there by mistake, or makes the file shorter, which would end the writer
     except OSError as reason:
         raise InputError(f"{path}: the feed cannot be made ({reason.strerror}).") from reason
     made[_HEADER.size :] = bytes(
