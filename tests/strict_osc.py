@@ -4,6 +4,7 @@ https://opensoundcontrol.stanford.edu/spec-1_0.html: sizes are multiples of four
 type tag is one that was asked for, nothing is left over.
 """
 
+import math
 import struct
 
 IMMEDIATELY = 1
@@ -54,7 +55,7 @@ def strict_message(data, tags_allowed, encoding="ascii"):
         else:
             insist(at + 4 <= len(data), "a number is missing")
             (value,) = struct.unpack_from({"i": ">i", "f": ">f"}[tag], data, at)
-            insist(value == value and abs(value) != float("inf"), "a number is none")
+            insist(math.isfinite(value), "a number is none")
             values.append(value)
             at += 4
     insist(at == len(data), "bytes are left over")

@@ -224,20 +224,20 @@ SHAPE = Address(
 UNIT = Address(
     "/tongue/unit",
     (Argument("weight", "f", "0 to 1", "K"),),
-    "`send=shapes`",
+    "`send=unit`",
     "The coefficients re-based: (weight - low) / (high - low). Exact also outside 0..1, where a pose beyond the range "
     "lies; the shapes `pose_0`, `pose_1`, ... are the same numbers, cut to 0..1.",
 )
 LOW = Address(
     "/tongue/low",
     (Argument("weight", "f", "raw", "K"),),
-    "`send=shapes`: start, every second",
+    "`send=unit`: start, every second",
     "The raw coefficients that 0 stands for in `/tongue/unit`: mean - 3 spread, unless the session has other ranges.",
 )
 HIGH = Address(
     "/tongue/high",
     (Argument("weight", "f", "raw", "K"),),
-    "`send=shapes`: start, every second",
+    "`send=unit`: start, every second",
     "The raw coefficients that 1 stands for: mean + 3 spread, or the session's.",
 )
 CONTACT = Address(
@@ -250,13 +250,15 @@ CONTACT = Address(
     ),
     "`send=contact`",
     "The smallest distance of tongue and palate in the mid-sagittal plane, below 0 where the tongue lies above the "
-    "palate; the tongue's point there, in the model's frame. Needs a palate in the session.",
+    "palate; the tongue's point there, in the model's frame. Needs a palate in the session. Left out where the palate "
+    "reaches over no part of the tongue.",
 )
 GAP = Address(
     "/tongue/gap/<name>",
     (Argument("gap", "f", "mm"),),
     "`send=contact`",
-    "The smallest distance within one region of the palate. Left out while no part of the tongue is below it.",
+    "The same for one region of the tongue's contour: tip, blade, front, body or back. Left out where the palate reaches "
+    "over no part of it.",
 )
 MESH = Address(
     "/tongue/mesh",
@@ -392,7 +394,7 @@ A sequence number of 0 is the start of a stream.
 ## More, where asked for
 
 A target with `send=` gets more than that, in datagrams of its own from a port of its own:
-`--to 'osc://127.0.0.1:9000?send=coils,shapes,contact,mesh'`, or as many of these words as wanted.
+`--to 'osc://127.0.0.1:9000?send=coils,shapes,unit,contact,mesh'`, or as many of these words as wanted.
 [streams.md](streams.md) shows how targets are written.
 
 {address_table(EXTRA_ADDRESSES)}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
@@ -114,6 +114,37 @@ class PackedBundle:
     def pack(self) -> None:
         """Writes all numbers into the datagram."""
         self._pack_into(self.datagram, 0, *self.parts)
+
+
+class NumbersMessage:
+    """A message that ends in `count` numbers (i or f), encoded but for them."""
+
+    def __init__(self, row: Address, count: int, path: str = "") -> None:
+        message = osc_message(row, [0] * count, path)
+        tags = _numbers_at_the_end(message)
+        self._head = struct.pack(">i", len(message)) + message[: len(message) - 4 * len(tags)]
+        self._pack = struct.Struct(f">{tags}").pack
+
+    def element(self, *numbers: float) -> bytes:
+        """With these numbers, as it stands in a bundle: its size before it."""
+        return self._head + self._pack(*numbers)
+
+
+BUNDLE_HEADER = b"#bundle\0" + struct.pack(">Q", IMMEDIATELY)
+
+
+def bundles_of(elements: Iterable[bytes], first: bytes) -> Iterator[bytes]:
+    """Bundles of at most MAX_DATAGRAM_BYTES, each beginning with the same element; none where there is no other."""
+    begun = BUNDLE_HEADER + first
+    parts, size = [begun], len(begun)
+    for element in elements:
+        if size + len(element) > MAX_DATAGRAM_BYTES and len(parts) > 1:
+            yield b"".join(parts)
+            parts, size = [begun], len(begun)
+        parts.append(element)
+        size += len(element)
+    if len(parts) > 1:
+        yield b"".join(parts)
 
 
 def _numbers_at_the_end(message: bytes) -> str:

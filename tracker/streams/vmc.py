@@ -38,9 +38,9 @@ VMC_TIME = Address(
 )
 VMC_VALUE = Address(
     "/VMC/Ext/Blend/Val",
-    (Argument("name", "s"), Argument("value", "f", limits=(-1.0, 1.0))),
+    (Argument("name", "s"), Argument("value", "f", limits=(0.0, 1.0))),
     "for every name of the preset",
-    "A blend shape.",
+    "A blend shape. Axes with two ends are left out: blend shapes are 0 to 1, and both ends have names of their own.",
 )
 VMC_APPLY = Address(
     "/VMC/Ext/Blend/Apply", (), "last", "The values since the last one belong together and are to be shown."
@@ -51,7 +51,7 @@ VMC_ADDRESSES = (VMC_OK, VMC_TIME, VMC_VALUE, VMC_APPLY)
 class VmcWorker:
     """A pose is one bundle; where the names of a preset are too many for one, several, and the last one applies.
 
-    Every bundle is at most MAX_DATAGRAM_BYTES long, below the protocol's 1500.
+    Every bundle is at most MAX_DATAGRAM_BYTES long, below the protocol's 1500. values: without signed ones.
     """
 
     def __init__(self, destination: str, values: AvatarValues) -> None:

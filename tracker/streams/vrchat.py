@@ -9,6 +9,9 @@ ExpressionTrackingActive switch such an avatar between tracking and its own anim
 
 from __future__ import annotations
 
+import re
+
+from ... import InputError
 from ..pose import PoseStatus, TrackedPose
 from .addresses import Address, Argument
 from .avatar import AvatarValues
@@ -19,6 +22,8 @@ from .udp import UdpSender
 DEFAULT_DESTINATION = "127.0.0.1:9000"
 UNIFIED = "unified"
 """The preset whose names are VRCFaceTracking's."""
+_PARAMETER = re.compile(r"[!-~]+")
+_RESERVED = re.compile(r"[#*,?\[\]{}]")
 
 PARAMETER = Address(
     "/avatar/parameters/<name>",
@@ -47,13 +52,22 @@ def parameter_prefixes(preset: str) -> tuple[str, ...]:
 
 
 class VrchatWorker:
-    """A pose is one bundle, or several where there are many names. prefixes: each name is sent once with each."""
+    """A pose is one bundle, or several where there are many names. prefixes: each name is sent once with each.
+
+    Raises InputError where a name cannot stand in an OSC address.
+    """
 
     def __init__(self, destination: str, values: AvatarValues, prefixes: tuple[str, ...]) -> None:
         self.destination = f"vrchat {destination}"
         self._sender = UdpSender(destination)
         self._values = values
         self._copies = len(prefixes)
+        for name in values.names:
+            if not _PARAMETER.fullmatch(name) or _RESERVED.search(name):
+                raise InputError(
+                    f"preset {values.preset}: the name '{name}' cannot stand in an OSC address; expected ASCII without "
+                    "spaces and # * , ? [ ] { }."
+                )
         body = [
             osc_message(PARAMETER, (0.0,), PARAMETER.path.replace("<name>", prefix + name))
             for prefix in prefixes
