@@ -139,7 +139,7 @@ def open_outputs(
     if outputs.targets:
         session = tracker.setup.session
         palate = None if session.palate is None else session.palate.points_mm
-        context = StreamContext(tracker.model, palate, session.shape_ranges)
+        context = StreamContext(tracker.model, palate, session.shape_ranges, control=control)
         for target in outputs.targets:
             for sink in open_target(target, context, opened.numbers, say_above):
                 stack.callback(sink.close)

@@ -36,7 +36,7 @@ from .shapes import SIGMAS, ShapeMeter
 from .sink import StreamContext, StreamInfo
 from .udp import UdpSender
 
-SENDABLE = ("coils", "shapes", "unit", "contact", "mesh")
+WORDS = ("coils", "shapes", "unit", "contact", "mesh")
 """The words of `send=`."""
 FINEST_STEP_MM = 0.0025
 """16 bits reach +-81.9 mm with it. A mesh that is farther from the origin has a coarser step."""
@@ -47,7 +47,7 @@ _MESH_HEAD = osc_message(MESH, (0, 0, 0, 0, 0.0, bytes(4)))[: -_MESH_NUMBERS.siz
 
 
 class MoreDatagrams:
-    """The datagrams of what `send` names, some of `SENDABLE`, for one pose after the other.
+    """The datagrams of what `send` names, some of `WORDS`, for one pose after the other.
 
     Small things come in one bundle, or in several that all begin with `/tongue/extra`; the mesh in chunks, each in a
     datagram of its own. Raises InputError for an unknown word, and for `contact` where there is no palate.
@@ -55,8 +55,8 @@ class MoreDatagrams:
 
     def __init__(self, context: StreamContext, send: Collection[str]) -> None:
         for word in send:
-            if word not in SENDABLE:
-                raise InputError(f"send={word}: this cannot be sent; expected some of {', '.join(SENDABLE)}.")
+            if word not in WORDS:
+                raise InputError(f"send={word}: this cannot be sent; expected some of {', '.join(WORDS)}.")
         self._extra = NumbersMessage(EXTRA, 3)
         self._coils: list[NumbersMessage] = []
         self._send_coils = "coils" in send

@@ -196,8 +196,7 @@ def _node(path: str, description: str, arguments: list[Argument], access: int) -
 class OscQueryWorker:
     """Serves the tree from threads of its own; a worker, so that it always has the newest pose.
 
-    address: HOST:PORT to listen at, port 0 = any; `address` then says which. control: HOST:PORT where the run takes
-    OSC, "" = nowhere. numbers: what the run says of itself. said: is called when it cannot be announced.
+    address: HOST:PORT to listen at, port 0 = any; `address` then says which. numbers: what the run says of itself. said: is called when it cannot be announced.
     Raises InputError where it cannot listen there. Only GET and HEAD; a few clients at a time, a hundred answers a second
     at most. Bound to this computer, it answers no page of a foreign site: their Host is another name.
     """
@@ -206,12 +205,11 @@ class OscQueryWorker:
         self,
         address: str,
         context: StreamContext,
-        control: str = "",
         numbers: Callable[[], LiveNumbers] | None = None,
         said: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._context = context
-        self._control = control
+        self._control = context.control
         self._numbers = numbers
         self._said = said
         self._server = _Server(address, self.answer)

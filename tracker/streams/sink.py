@@ -36,13 +36,15 @@ class StreamContext:
     """What a stream may know of a run beyond `StreamInfo`, to turn weights into shapes, points and distances.
 
     palate: (p, 3) mm in the model frame, from front to back, or None; ranges: of the speaker's avatar shapes, name ->
-    lowest and highest value, empty where they were never measured; name: of the stream, for people and receivers.
+    lowest and highest value, empty where they were never measured; name: of the stream, for people and receivers;
+    control: HOST:PORT where the run takes control messages over OSC, "" = nowhere.
     """
 
     model: TongueModel
     palate: FloatArray | None = None
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     name: str = "tonguetrack"
+    control: str = ""
 
 
 Pair = tuple[float | None, float | None]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from urllib.parse import parse_qsl, unquote
 
 from ... import InputError
-from ..pose import FloatArray, TrackedPose
+from ..pose import TrackedPose
 from .filtered import FilteredWorker
 from .oneeuro import OneEuro
 from .osc import OscSink, parse_destination, resolve
@@ -18,6 +18,8 @@ from .slot import SlotSink, Worker
 MAX_TARGET_LENGTH = 1000
 AVATAR_RATE_HZ = 60.0
 """What avatar programs draw and expect; unless `rate` says otherwise."""
+LOOK_UP_RATE_HZ = 20.0
+"""How often a value that somebody may ask for is renewed."""
 HIGHEST_RATE_HZ = 1000.0
 
 _RATE = {"rate": "poses a second at most, 0 = every frame"}
@@ -80,6 +82,14 @@ KINDS: tuple[TargetKind, ...] = (
         _CALM,
     ),
     TargetKind("lsl", "lsl:NAME", "Lab Streaming Layer, two outlets", 0, None, _RATE, extra="lab"),
+    TargetKind(
+        "oscquery",
+        "oscquery://HOST[:9002]",
+        "listens there, and tells OSCQuery clients of every OSC address and its value",
+        9002,
+        LOOK_UP_RATE_HZ,
+        {},
+    ),
 )
 
 
@@ -146,7 +156,7 @@ def open_target(
         return SlotSink(worker, target.rate_hz, said)
 
     if target.kind.scheme != "osc":
-        return [slot(_worker(target, context))]
+        return [slot(_worker(target, context, numbers, said))]
     osc = OscSink(target.destination)
     osc.numbers = numbers
     # For every frame, it costs less to send than to hand on to a thread.
@@ -181,36 +191,32 @@ class OscWorker:
         self._sink.close()
 
 
-class PresetValues:
-    """The numbers of a preset, measured on each pose."""
-
-    def __init__(self, preset: str, context: StreamContext) -> None:
-        from .presets import load_preset
-        from .shapes import ShapeMeter
-
-        self._meter = ShapeMeter(context.model, context.ranges)
-        self._mixer = load_preset(preset).mixer(self._meter.names)
-        self.names = self._mixer.names
-
-    def values(self, pose: TrackedPose) -> FloatArray:
-        return self._mixer(self._meter.measure(pose.speaker_weights, pose.weights))
-
-
-def _worker(target: Target, context: StreamContext) -> Worker:
+def _worker(
+    target: Target,
+    context: StreamContext,
+    numbers: Callable[[], LiveNumbers] | None,
+    said: Callable[[str], None],
+) -> Worker:
     match target.kind.scheme:
         case "vmc":
+            from .avatar import avatar_values
             from .vmc import VmcWorker
 
-            return VmcWorker(target.destination, PresetValues(target.preset, context))
+            return VmcWorker(target.destination, avatar_values(target.preset, context, signed=False))
         case "vrchat":
+            from .avatar import avatar_values
             from .vrchat import VrchatWorker, parameter_prefixes
 
-            values = PresetValues(target.preset, context)
+            values = avatar_values(target.preset, context, signed=True)
             return VrchatWorker(target.destination, values, parameter_prefixes(target.preset))
         case "json":
             from .json_out import JsonWorker
 
             return JsonWorker(target.destination)
+        case "oscquery":
+            from .oscquery import OscQueryWorker
+
+            return OscQueryWorker(target.destination, context, numbers, said)
         case _:
             from .lsl import LslWorker
 
