@@ -53,7 +53,7 @@ class View:
 def home_view(scene: Scene) -> View:
     """From the left, the front and above, near enough that the tongue fills its panel."""
     low, high = scene.extent
-    distance = 0.48 * np.linalg.norm(high - low) / np.sin(np.radians(FIELD_DEG / 2))
+    distance = 0.40 * np.linalg.norm(high - low) / np.sin(np.radians(FIELD_DEG / 2))
     centre = 0.5 * (low + high)
     return View(52.0, 24.0, float(distance), (float(centre[0]), float(centre[1]), float(centre[2])))
 

@@ -32,7 +32,6 @@ from .shaders import (
     CUT_FRAGMENT,
     CUT_VERTEX,
     GHOST_FRAGMENT,
-    GROUND_FRAGMENT,
     INSIDE_FRAGMENT,
     TEXTURE_WIDTH,
     TONGUE_FRAGMENT,
@@ -64,8 +63,6 @@ class Renderer:
         self._tongue, self._ghost = (Surface(self._programs, followed) for _ in range(2))
         self._tongue_program, self._tongue_array = tongue_vertex_array(self._programs, TONGUE_FRAGMENT)
         self._ghost_program, self._ghost_array = tongue_vertex_array(self._programs, GHOST_FRAGMENT)
-        self._ground_program = context.program(WHOLE_VERTEX, fragment_shader=GROUND_FRAGMENT)
-        self._ground_array = context.vertex_array(self._ground_program, [])
         self._cut_program = context.program(CUT_VERTEX, fragment_shader=CUT_FRAGMENT)
         self._cut_points = context.buffer(reserve=8 * len(scene.outline.shares), dynamic=True)
         self._cut_array = context.vertex_array(self._cut_program, [(self._cut_points, "2f", "in_place")])
@@ -91,11 +88,12 @@ class Renderer:
             if self._typeface is not None:
                 self._typeface.release()
             self._typeface = Typeface(self._context, self.layout.font_px)
+        self._markings = Markings(self.scene, self.look, self.layout, self._typeface)
         self._release_inside()
         flat = self.layout.flat
-        texture = self._context.texture((flat.width, flat.height), 1, alignment=1)
+        # Half as fine as the picture: the contour's line covers its edge.
+        texture = self._context.texture((-(-flat.width // 2), -(-flat.height // 2)), 1, alignment=1)
         self._inside = self._context.framebuffer([texture])
-        self._ground_program["height"] = float(self.size[1])
         self._flat_projection = flat_projection(self.scene, flat, 2.2 * self.layout.font_px)
 
     def remember(self, moment: Moment) -> None:
@@ -117,34 +115,30 @@ class Renderer:
             self._ghost.show(view.ghost)
         legend = self._colour(moment, view)
         solid = solid_projection(view, self.layout.solid)
-        assert self._typeface is not None
-        markings = Markings(self.scene, self.look, self.layout, self._typeface)
         tongue = self._section(self._tongue)
         ghost = None if view.ghost is None else self._section(self._ghost)
-        self._fill_inside(tongue.outline)
-
         context = self._context
-        framebuffer.use()
-        framebuffer.scissor = None
-        framebuffer.viewport = (0, 0, *self.size)
-        framebuffer.depth_mask = True
-        context.disable(context.BLEND | context.CULL_FACE | context.DEPTH_TEST)
-        framebuffer.clear(depth=1.0)
-        self._ground_array.render(vertices=3)
         self._draw_tongue(framebuffer, view, solid, legend is not None)
-        framebuffer.depth_mask = False
+        # A software rasteriser starts on the tongue when the target changes; meanwhile the marks are put together.
+        self._fill_inside(tongue.outline)
         trails = self._trails(moment, view)
-        rows = markings.in_space(moment, solid, tongue, trails)
-        self._draw_marks(framebuffer, faint(rows), self.layout.solid)
+        in_space = self._markings.in_space(moment, solid, tongue, trails)
+        in_plane = self._markings.in_plane(moment, self._flat_projection, tongue, ghost, trails)
+        around = self._markings.around(moment, view, solid, self._flat_projection, legend)
+
+        framebuffer.use()
+        context.enable(context.BLEND)
+        context.blend_func = context.SRC_ALPHA, context.ONE_MINUS_SRC_ALPHA
+        self._limit(framebuffer, self.layout.solid)
+        self._draw_marks(faint(in_space))
         context.enable(context.DEPTH_TEST)
-        self._draw_marks(framebuffer, rows, self.layout.solid)
+        self._draw_marks(in_space)
         context.disable(context.DEPTH_TEST)
+        self._limit(framebuffer, self.layout.flat)
         self._draw_inside(framebuffer)
-        rows = markings.in_plane(moment, self._flat_projection, tongue, ghost, trails)
-        self._draw_marks(framebuffer, rows, self.layout.flat)
-        rows = markings.around(moment, view, solid, self._flat_projection, legend)
-        self._draw_marks(framebuffer, rows, None)
-        framebuffer.scissor = None
+        self._draw_marks(in_plane)
+        self._limit(framebuffer, None)
+        self._draw_marks(around)
         framebuffer.depth_mask = True
 
     def _section(self, tongue: Surface) -> Section:
@@ -155,25 +149,30 @@ class Renderer:
     def _draw_tongue(
         self, framebuffer: moderngl.Framebuffer, view: View, solid: Projection, by_value: bool
     ) -> None:
-        context = self._context
-        area = self.layout.solid
+        """The grounds, the tongue, and the ghost over it."""
+        context, area = self._context, self.layout.solid
+        framebuffer.use()
+        framebuffer.depth_mask = True
+        self._limit(framebuffer, None)
+        framebuffer.clear(*self.look.panel, depth=1.0)
+        self._limit(framebuffer, area)
+        framebuffer.clear(*self.look.background, depth=1.0)
         framebuffer.viewport = self._from_below(area)
-        placed = np.eye(4)
-        placed[:3, :3] = camera_axes(view)
-        placed[:3, 3] = -placed[:3, :3] @ (np.asarray(view.centre) + view.distance_mm * placed[2, :3])
         for program in (self._tongue_program, self._ghost_program):
             program["to_clip"].write(np.ascontiguousarray(solid.matrix.T, dtype="f4").tobytes())
-            program["to_camera"].write(np.ascontiguousarray(placed.T, dtype="f4").tobytes())
-        context.enable(context.DEPTH_TEST)
+            program["to_camera"].write(np.ascontiguousarray(camera_axes(view).T, dtype="f4").tobytes())
         self._tongue_program["by_value"] = int(by_value)
         self._values.use(2)
         self._grain.use(3)
+        context.disable(context.BLEND | context.CULL_FACE)
+        context.enable(context.DEPTH_TEST)
         self._draw_surface(self._tongue, self._tongue_array)
-        context.enable(context.BLEND)
-        context.blend_func = context.SRC_ALPHA, context.ONE_MINUS_SRC_ALPHA
-        context.disable(context.DEPTH_TEST)
+        framebuffer.depth_mask = False
         if view.ghost is not None:
+            context.enable(context.BLEND | context.CULL_FACE)
+            context.blend_func = context.SRC_ALPHA, context.ONE_MINUS_SRC_ALPHA
             self._draw_surface(self._ghost, self._ghost_array)
+        context.disable(context.DEPTH_TEST | context.CULL_FACE)
         framebuffer.viewport = (0, 0, *self.size)
 
     def _draw_surface(self, tongue: Surface, array: moderngl.VertexArray) -> None:
@@ -199,19 +198,21 @@ class Renderer:
 
     def _draw_inside(self, framebuffer: moderngl.Framebuffer) -> None:
         assert self._inside is not None
-        corner = self._from_below(self.layout.flat)
+        panel = self._from_below(self.layout.flat)
         self._inside.color_attachments[0].use(0)
-        self._inside_program["corner"] = corner[:2]
-        framebuffer.viewport = corner
+        self._inside_program["panel"] = panel
+        framebuffer.viewport = panel
         self._inside_array.render(vertices=3)
         framebuffer.viewport = (0, 0, *self.size)
 
-    def _draw_marks(
-        self, framebuffer: moderngl.Framebuffer, rows: NDArray[np.float32], area: Area | None
-    ) -> None:
+    def _draw_marks(self, rows: NDArray[np.float32]) -> None:
         assert self._typeface is not None
-        framebuffer.scissor = None if area is None else self._from_below(area)
         self._drawer.draw(rows, self.size, self._typeface.atlas)
+
+    def _limit(self, framebuffer: moderngl.Framebuffer, area: Area | None) -> None:
+        """Nothing is drawn outside the area; None = the whole picture."""
+        framebuffer.viewport = (0, 0, *self.size)
+        framebuffer.scissor = framebuffer.viewport if area is None else self._from_below(area)
 
     def _from_below(self, area: Area) -> tuple[int, int, int, int]:
         """The area as OpenGL counts: from the lower left corner."""
@@ -263,13 +264,13 @@ class Renderer:
         tongue["near_colour"], tongue["far_colour"], tongue["unknown"] = look.near, look.far, look.unknown
         tongue["ambient"] = look.ambient
         lights = (look.key, look.fill)
-        tongue["light_ways"] = [
-            tuple(np.array(light.direction) / np.linalg.norm(light.direction)) for light in lights
-        ]
+        ways = [np.array(light.direction) / np.linalg.norm(light.direction) for light in lights]
+        tongue["light_ways"] = [tuple(way) for way in ways]
         tongue["light_colours"] = [light.colour for light in lights]
+        between = ways[0] + (0.0, 0.0, 1.0)
+        tongue["between"] = tuple(between / np.linalg.norm(between))
         ghost = self._ghost_program
         ghost["positions"], ghost["normals"], ghost["tint"] = 0, 1, look.ghost
-        self._ground_program["top"], self._ground_program["bottom"] = look.background
         self._inside_program["cut"], self._inside_program["tint"] = 0, look.flat
 
     def _release_inside(self) -> None:
@@ -283,9 +284,9 @@ class Renderer:
         if self._typeface is not None:
             self._typeface.release()
         things = (
-            self._drawer, self._tongue, self._ghost, self._tongue_array, self._ghost_array, self._ground_array,
+            self._drawer, self._tongue, self._ghost, self._tongue_array, self._ghost_array,
             self._cut_array, self._inside_array, self._cut_points, self._values, self._grain, self._tongue_program,
-            self._ghost_program, self._ground_program, self._cut_program, self._inside_program, self._programs,
+            self._ghost_program, self._cut_program, self._inside_program, self._programs,
         )  # fmt: skip
         for thing in things:
             thing.release()

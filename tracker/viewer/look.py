@@ -22,13 +22,21 @@ class Light:
     colour: Colour
 
 
+NEAR = colour("d62f3a")
+"""A vertex at the palate, or one that is not known well."""
+FAR = colour("3d6fd6")
+UNKNOWN = colour("8a8a8a")
+KEY = Light((-0.45, 0.75, 0.65), (1.0, 0.96, 0.9))
+FILL = Light((0.8, 0.1, 0.45), (0.34, 0.38, 0.46))
+
+
 @dataclass(frozen=True)
 class Look:
-    """background: at the top and at the bottom; panel: behind the flat view; tissue, inside: of the mesh from
+    """background: behind the solid view; panel: behind the flat one and the bars; tissue, inside: of the mesh from
     outside and from inside; flat: of the cut in the flat view; coils: one after the other, again from the first when
     there are more; warning: a coil that does not count."""
 
-    background: tuple[Colour, Colour]
+    background: Colour
     panel: Colour
     line: Colour
     text: Colour
@@ -42,11 +50,11 @@ class Look:
     ghost: Colour
     bar: Colour
     coils: tuple[Colour, ...]
-    near: Colour = colour("d62f3a")  # a vertex at the palate, or one that is well known
-    far: Colour = colour("3d6fd6")
-    unknown: Colour = colour("8a8a8a")
-    key: Light = Light((-0.45, 0.75, 0.65), (1.0, 0.96, 0.9))
-    fill: Light = Light((0.8, 0.1, 0.45), (0.34, 0.38, 0.46))
+    near: Colour = NEAR
+    far: Colour = FAR
+    unknown: Colour = UNKNOWN
+    key: Light = KEY
+    fill: Light = FILL
     ambient: Colour = (0.20, 0.19, 0.21)
     ball_mm: float = 1.6
     font_share: float = 1 / 42  # of the picture's height
@@ -56,7 +64,7 @@ class Look:
 
 # Okabe and Ito's palette, which people with any colour vision can tell apart, lightened or darkened for the ground.
 DARK = Look(
-    background=(colour("2a2f38"), colour("14161a")),
+    background=colour("21252c"),
     panel=colour("191c21"),
     line=colour("4a515c"),
     text=colour("eceff3"),
@@ -72,7 +80,7 @@ DARK = Look(
     coils=tuple(map(colour, ("f5d547", "4fc3f7", "5fd38d", "ff9e57", "d6a3ff", "ffffff"))),
 )
 LIGHT = Look(
-    background=(colour("fbfbfc"), colour("dfe3e9")),
+    background=colour("e9ecf0"),
     panel=colour("ffffff"),
     line=colour("aab1bc"),
     text=colour("16191e"),

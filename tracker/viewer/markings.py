@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..pose import CoilState, FloatArray, PoseStatus
-from .camera import Area, Layout, Projection, View
+from .camera import Layout, Projection, View
 from .look import Colour, Look
 from .overlay import Marks, Typeface
 from .scene import COIL_WORDS, STATUS_WORDS, Moment, Scene
@@ -44,12 +44,13 @@ class Legend:
 
 
 class Markings:
-    """Makes the rows of marks of one picture."""
+    """Makes the rows of marks of one picture after the other, in one layout."""
 
     def __init__(self, scene: Scene, look: Look, layout: Layout, typeface: Typeface) -> None:
         self._scene, self._look, self._layout, self._typeface = scene, look, layout, typeface
         self._stroke = max(1.0, layout.font_px / 9)
         self._marks = Marks(typeface)
+        self._always: NDArray[np.float32] | None = None
 
     def in_space(
         self, moment: Moment, projection: Projection, tongue: Section, trails: Trails | None
@@ -75,7 +76,9 @@ class Markings:
             self._marks.polyline(projection.pixels(self._scene.palate), 2 * stroke, look.palate)
         if ghost is not None:
             self._marks.polyline(projection.pixels(ghost.outline), 1.6 * stroke, look.ghost, 0.9)
-        self._marks.polyline(projection.pixels(tongue.outline), 2 * stroke, look.contour)
+        outline = projection.pixels(tongue.outline)
+        self._marks.polyline(outline[[-1, 0]], stroke, look.contour, 0.35)  # where the mesh is open
+        self._marks.polyline(outline, 2 * stroke, look.contour)
         self._coils(moment, projection, tongue.feet, trails)
         return self._marks.taken()
 
@@ -83,12 +86,16 @@ class Markings:
         self, moment: Moment, view: View, solid: Projection, flat: Projection, legend: Legend | None
     ) -> NDArray[np.float32]:
         """Words, numbers and bars, on top of everything."""
+        if self._always is None:
+            self._directions(flat)
+            self._scale_of_bars()
+            self._always = self._marks.taken()
+        self._marks.rows(self._always)
         for projection in (solid, flat):
             self._names(moment, projection)
         self._status(moment, view)
         if legend is not None:
             self._legend(legend)
-        self._directions(flat)
         self._bars(moment)
         return self._marks.taken()
 
@@ -97,18 +104,21 @@ class Markings:
             return
         marks, look = self._marks, self._look
         coils = projection.pixels(moment.coils)
+        colours = np.array([self._colour(coil, moment) for coil in range(len(coils))])
         if trails is not None:
-            count = len(moment.coils)
-            places = projection.pixels(trails.coils.reshape(-1, 3)).reshape(-1, count, 3)
-            fading = 0.75 * (1.0 - trails.ages[1:])
-            for coil in range(count):
-                marks.polyline(places[:, coil], 1.2 * self._stroke, self._colour(coil, moment), fading)
-        sticks = projection.pixels(feet)
-        marks.lines(coils, sticks, 1.2 * self._stroke, look.text)
-        sizes = look.ball_mm * projection.pixels_per_mm(moment.coils)
-        for coil, (place, size) in enumerate(zip(coils, sizes, strict=True)):
-            if np.isfinite(place).all():
-                marks.ball(place, max(3.0, float(size)), self._colour(coil, moment))
+            times = len(trails.ages) - 1
+            places = projection.pixels(trails.coils.reshape(-1, 3))
+            fading = np.repeat(0.75 * (1.0 - trails.ages[1:]), len(coils))
+            width = 1.2 * self._stroke
+            marks.lines(
+                places[: -len(coils)], places[len(coils) :], width, np.tile(colours, (times, 1)), fading
+            )
+        marks.lines(coils, projection.pixels(feet), 1.2 * self._stroke, look.text)
+        marks.balls(coils, self._radii(moment, projection), colours)
+
+    def _radii(self, moment: Moment, projection: Projection) -> FloatArray:
+        """(n,) of the balls, pixels."""
+        return np.maximum(3.0, self._look.ball_mm * projection.pixels_per_mm(moment.coils))
 
     def _colour(self, coil: int, moment: Moment) -> Colour:
         if moment.coil_states[coil] not in (CoilState.TRUSTED, CoilState.MISSING):
@@ -119,13 +129,13 @@ class Markings:
         """Beside the coils, inside the area, none on top of another."""
         if not len(moment.coils):
             return
-        area, typeface, marks = projection.area, self._typeface, self._marks
+        area, typeface = projection.area, self._typeface
         places = projection.pixels(moment.coils)
-        sizes = np.maximum(3.0, self._look.ball_mm * projection.pixels_per_mm(moment.coils))
+        sizes = self._radii(moment, projection)
         taken: list[tuple[float, float, float]] = []
-        for coil in np.argsort(np.where(np.isnan(places[:, 1]), np.inf, places[:, 1])):
-            x, y, _ = places[coil]
-            if not (np.isfinite(x) and area.holds(x, y)):
+        for coil in np.argsort(places[:, 1]).tolist():  # from above; NaN at the end
+            x, y = places[coil, :2].tolist()
+            if not area.holds(x, y):
                 continue
             state = COIL_WORDS.get(CoilState(int(moment.coil_states[coil])))
             name = self._scene.names[coil] + (f" ({state})" if state else "")
@@ -139,7 +149,7 @@ class Markings:
                 if left < other_right and other_left < left + width and top < bottom:
                     top = bottom
             taken.append((left, left + width, top + typeface.line_px))
-            self._backed(left, top, name, self._colour(int(coil), moment))
+            self._backed(left, top, name, self._colour(coil, moment))
 
     def _backed(self, x: float, y: float, text: str, colour: Colour) -> None:
         """Text on a ground of its own, readable on the tongue as well."""
@@ -203,34 +213,47 @@ class Markings:
         marks.lines(ends - tick, ends + tick, 1.0, look.text)
         marks.text(left + 0.5 * (length - typeface.width(words)), y - typeface.line_px - 3, words, look.text)
 
-    def _bars(self, moment: Moment) -> None:
+    @property
+    def _bar_places(self) -> tuple[float, float, float, float]:
+        """Left, right, the middle's height, and pixels per sigma."""
+        area, typeface = self._layout.bars, self._typeface
+        left = area.x + 12 + typeface.width("+3")
+        top, bottom = area.y + typeface.line_px + 6.0, area.y + area.height - typeface.line_px
+        return left, area.x + area.width - 6.0, 0.5 * (top + bottom), 0.5 * (bottom - top) / SIGMA_SHOWN
+
+    def _scale_of_bars(self) -> None:
         look, typeface, marks, area = self._look, self._typeface, self._marks, self._layout.bars
-        line = typeface.line_px
+        left, right, middle, per_sigma = self._bar_places
         marks.text(area.x + 6, area.y + 2, "pose weights in sigma", look.faint_text)
-        left = area.x + 6 + typeface.width("+3") + 6
-        right, top, bottom = area.x + area.width - 6.0, area.y + line + 6.0, area.y + area.height - line
-        middle, per_sigma = 0.5 * (top + bottom), 0.5 * (bottom - top) / SIGMA_SHOWN
         for sigma in (SIGMA_MARK, 0.0, -SIGMA_MARK):
             y = middle - sigma * per_sigma
             words = f"{sigma:+.0f}" if sigma else "0"
             marks.text(left - 6 - typeface.width(words), y - 0.6 * typeface.size_px, words, look.faint_text)
-            ends = np.array([[left, y, -1.0], [right, y, -1.0]])
-            marks.polyline(ends, 1.0, look.line)
-        count = len(moment.normalised)
-        step = (right - left) / max(count, 1)
-        every = int(np.ceil(typeface.width(str(count)) * 1.5 / step)) if count else 1
+            marks.polyline(np.array([[left, y, -1.0], [right, y, -1.0]]), 1.0, look.line)
+        count = self._scene.model.pose.size
+        step = (right - left) / count
+        every = int(np.ceil(1.5 * typeface.width(str(count)) / step))
+        for number in range(0, count, every):
+            name = str(number + 1)
+            x = left + (number + 0.5) * step - 0.5 * typeface.width(name)
+            marks.text(x, area.y + area.height - typeface.line_px, name, look.faint_text)
+
+    def _bars(self, moment: Moment) -> None:
+        look, typeface, marks = self._look, self._typeface, self._marks
+        left, right, middle, per_sigma = self._bar_places
+        step = (right - left) / max(len(moment.normalised), 1)
         half = min(0.32 * step, 1.6 * typeface.size_px)
-        for number, sigma in enumerate(moment.normalised):
+        reach = SIGMA_SHOWN * per_sigma
+        for number, sigma in enumerate(moment.normalised.tolist()):
             x = left + (number + 0.5) * step
-            end = middle - float(np.clip(sigma, -SIGMA_SHOWN, SIGMA_SHOWN)) * per_sigma
-            beyond = abs(sigma) > SIGMA_MARK
-            colour = look.warning if beyond else look.bar
+            end = middle - min(max(sigma * per_sigma, -reach), reach)
+            colour = look.warning if abs(sigma) > SIGMA_MARK else look.bar
             marks.bar(x - half, min(middle, end), x + half, max(middle, end), colour)
-            if number % every == 0:
-                name = str(number + 1)
-                marks.text(x - 0.5 * typeface.width(name), bottom, name, look.faint_text)
             value = f"{sigma:+.1f}"
-            if typeface.width(value) < 0.96 * step:
-                above = end - line if sigma >= 0 else end + 1
-                above = float(np.clip(above, top - line * 0.4, bottom - line + 4))
-                marks.text(x - 0.5 * typeface.width(value), above, value, look.text)
+            if (width := typeface.width(value)) < 0.96 * step:
+                y = (
+                    max(end, middle - reach + 4) - typeface.line_px
+                    if sigma >= 0
+                    else min(end, middle + reach - 12)
+                )
+                marks.text(x - 0.5 * width, y, value, look.text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +44,8 @@ class Offscreen:
             self.renderer.draw(moment, view, self._smooth)
             self._context.copy_framebuffer(self._plain, self._smooth)
         width, height = self.size
-        pixels = np.frombuffer(self._plain.read(components=4), dtype=np.uint8).reshape(height, width, 4)
-        return np.ascontiguousarray(pixels[::-1, :, :3])
+        pixels = np.frombuffer(self._plain.read(components=3, alignment=1), dtype=np.uint8)
+        return np.ascontiguousarray(pixels.reshape(height, width, 3)[::-1])
 
     def _target(self, samples: int) -> moderngl.Framebuffer:
         context, size = self._context, self.size
@@ -62,7 +62,7 @@ class Offscreen:
                     part.release()
         self._context.release()
 
-    def __enter__(self) -> Offscreen:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ... import InputError
 from ..pose import FloatArray
@@ -42,9 +41,11 @@ class Typeface:
         self._row_px = round(1.5 * size_px)
         self._free = (1, 1)
         self._letters: dict[str, tuple[float, ...]] = {}
+        # Most words stand in every picture again.
         self.row = lru_cache(maxsize=512)(self._row)
+        self.width = lru_cache(maxsize=512)(self._width)
 
-    def width(self, text: str) -> float:
+    def _width(self, text: str) -> float:
         """How many pixels wide the text is."""
         return float(sum(self._letter(letter)[0] for letter in plain_letters(text)))
 
@@ -69,17 +70,16 @@ class Typeface:
         return [*lines, line] if line else lines
 
     def _row(self, text: str) -> NDArray[np.float32]:
-        """(n, COLUMNS) the text's letters in white, its upper left corner at 0, 0."""
-        rows = np.zeros((len(plain_letters(text)), COLUMNS), dtype=np.float32)
-        x = 0.0
-        for row, letter in zip(rows, plain_letters(text), strict=True):
-            advance, width, left, top, right, bottom = self._letter(letter)
-            row[0] = LETTER
-            row[1:5] = x, 0, x + width, self._row_px
-            row[5:7] = NEAREST_DEPTH
-            row[8:12] = 1.0
-            row[12:16] = left, top, right, bottom
-            x += advance
+        """(n, COLUMNS) the text's letters in black, its upper left corner at 0, 0."""
+        letters = np.array([self._letter(letter) for letter in plain_letters(text)]).reshape(-1, 6)
+        rows = np.zeros((len(letters), COLUMNS), dtype=np.float32)
+        rows[:, 0] = LETTER
+        rows[:, 1] = np.cumsum(letters[:, 0]) - letters[:, 0]
+        rows[:, 3] = rows[:, 1] + letters[:, 1]
+        rows[:, 4] = self._row_px
+        rows[:, 5:7] = NEAREST_DEPTH
+        rows[:, 11] = 1.0
+        rows[:, 12:16] = letters[:, 2:]
         return rows
 
     def _letter(self, letter: str) -> tuple[float, ...]:
@@ -124,31 +124,43 @@ class Marks:
         self.typeface = typeface
         self._parts: list[NDArray[np.float32]] = []
 
-    def lines(
-        self, first: FloatArray, second: FloatArray, thickness: float, colour: Colour, alpha: Any = 1.0
-    ) -> None:
-        """Straight lines from points (n, 3) to points (n, 3): x, y, depth. alpha: one, or (n,). NaN: not drawn."""
-        there = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
-        rows = np.zeros((int(there.sum()), COLUMNS), dtype=np.float32)
-        rows[:, 1:3], rows[:, 3:5] = first[there, :2], second[there, :2]
-        rows[:, 5], rows[:, 6] = first[there, 2], second[there, 2]
-        rows[:, 7] = thickness
-        rows[:, 8:11] = colour
-        rows[:, 11] = alpha if np.isscalar(alpha) else np.asarray(alpha)[there]
+    def rows(self, rows: NDArray[np.float32]) -> None:
+        """Marks that were made before."""
         self._parts.append(rows)
 
-    def polyline(self, points: FloatArray, thickness: float, colour: Colour, alpha: Any = 1.0) -> None:
-        """A line through points (n, 3); alpha: one, or (n - 1,)."""
-        self.lines(points[:-1], points[1:], thickness, colour, alpha)
+    def lines(
+        self,
+        first: FloatArray,
+        second: FloatArray,
+        thickness: float,
+        colours: ArrayLike,
+        alphas: ArrayLike = 1.0,
+    ) -> None:
+        """Straight lines from points (n, 3) to points (n, 3): x, y, depth. NaN: not drawn.
 
-    def ball(self, place: FloatArray, radius: float, colour: Colour, alpha: float = 1.0) -> None:
-        """place: (3,) x, y, depth."""
-        row = np.zeros((1, COLUMNS), dtype=np.float32)
-        row[0, :3] = BALL, place[0], place[1]
-        row[0, 5:7] = place[2]
-        row[0, 7] = radius
-        row[0, 8:12] = *colour, alpha
-        self._parts.append(row)
+        colours: (3,) or (n, 3); alphas: one, or (n,).
+        """
+        rows = np.zeros((len(first), COLUMNS), dtype=np.float32)
+        rows[:, 1:3], rows[:, 3:5] = first[:, :2], second[:, :2]
+        rows[:, 5], rows[:, 6] = first[:, 2], second[:, 2]
+        rows[:, 7] = thickness
+        rows[:, 8:11] = colours
+        rows[:, 11] = alphas
+        self._parts.append(rows[np.isfinite(rows).all(axis=1)])
+
+    def polyline(self, points: FloatArray, thickness: float, colour: Colour, alphas: ArrayLike = 1.0) -> None:
+        """A line through points (n, 3); alphas: one, or (n - 1,)."""
+        self.lines(points[:-1], points[1:], thickness, colour, alphas)
+
+    def balls(self, places: FloatArray, radii: FloatArray, colours: FloatArray) -> None:
+        """At places (n, 3): x, y, depth; radii (n,) pixels, colours (n, 3). NaN: not drawn."""
+        rows = np.zeros((len(places), COLUMNS), dtype=np.float32)
+        rows[:, 0] = BALL
+        rows[:, 1:3] = places[:, :2]
+        rows[:, 5:7] = places[:, 2:]
+        rows[:, 7] = radii
+        rows[:, 8:11], rows[:, 11] = colours, 1.0
+        self._parts.append(rows[np.isfinite(rows).all(axis=1)])
 
     def bar(
         self, left: float, top: float, right: float, bottom: float, colour: Colour, alpha: float = 1.0
@@ -159,21 +171,13 @@ class Marks:
         row[0, 8:12] = *colour, alpha
         self._parts.append(row)
 
-    def text(self, x: float, y: float, text: str, colour: Colour, alpha: float = 1.0) -> None:
+    def text(self, x: float, y: float, text: str, colour: Colour) -> None:
         """One line; x, y: the upper left corner."""
-        rows = self.typeface.row(text).copy()
-        rows[:, [1, 3]] += round(x)
-        rows[:, [2, 4]] += round(y)
-        rows[:, 8:11] = colour
-        rows[:, 11] = alpha
-        self._parts.append(rows)
-
-    def block(self, x: float, y: float, lines: Sequence[str], colour: Colour) -> float:
-        """Lines below each other; returns where the next would stand."""
-        for line in lines:
-            self.text(x, y, line, colour)
-            y += self.typeface.line_px
-        return y
+        move = np.zeros(COLUMNS, dtype=np.float32)
+        move[1] = move[3] = round(x)
+        move[2] = move[4] = round(y)
+        move[8:11] = colour
+        self._parts.append(self.typeface.row(text) + move)
 
     def taken(self) -> NDArray[np.float32]:
         """(n, COLUMNS) everything gathered so far, which is forgotten."""

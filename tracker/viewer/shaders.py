@@ -61,9 +61,8 @@ uniform sampler2D positions;
 uniform sampler2D normals;
 uniform sampler2D values;      // what the vertices are coloured by, 0 to 1, negative = unknown
 uniform mat4 to_clip;
-uniform mat4 to_camera;
+uniform mat3 to_camera;
 in vec2 in_skin;
-out vec3 place;
 out vec3 normal;
 out vec2 skin;
 out float value;
@@ -71,8 +70,7 @@ void main() {
     ivec2 at = ivec2(gl_VertexID % WIDTH, gl_VertexID / WIDTH);
     vec4 here = vec4(texelFetch(positions, at, 0).xyz, 1.0);
     gl_Position = to_clip * here;
-    place = (to_camera * here).xyz;
-    normal = mat3(to_camera) * texelFetch(normals, at, 0).xyz;
+    normal = to_camera * texelFetch(normals, at, 0).xyz;
     value = texelFetch(values, at, 0).x;
     skin = in_skin;
 }
@@ -80,6 +78,7 @@ void main() {
 
 # Colours are squared before light is added up and rooted afterwards, near enough to what screens do. Light wraps
 # round the edge of the shadow, red farther than blue, as it does under skin; wet tissue has a sharp and a dull gloss.
+# The eye is taken to be far away, which saves two roots in every pixel.
 TONGUE_FRAGMENT = """
 #version 330
 uniform sampler2D grain;       // two slopes and a tint
@@ -92,58 +91,42 @@ uniform int by_value;
 uniform vec3 ambient;
 uniform vec3 light_ways[2];
 uniform vec3 light_colours[2];
-in vec3 place;
+uniform vec3 between;          // half way between the first light and the eye
 in vec3 normal;
 in vec2 skin;
 in float value;
 out vec4 colour;
-const vec3 WRAP = vec3(0.50, 0.26, 0.22);
+const vec3 WRAP = vec3(0.42, 0.16, 0.13);
 void main() {
     vec3 bumps = texture(grain, skin).xyz - 0.5;
-    vec3 n = normalize(normal);
-    vec3 to_eye = normalize(-place);
-    vec3 body = tissue;
-    float wet = 1.0;
-    if (!gl_FrontFacing) { n = -n; body = inside; wet = 0.3; }
-    else if (by_value == 1) body = value < 0.0 ? unknown : mix(near_colour, far_colour, value);
-    n = normalize(n + vec3(bumps.xy, 0.0) * 0.22 * wet);
-    body *= body * (1.0 + 0.5 * bumps.z);
-    vec3 light = ambient * (0.75 + 0.25 * n.y);
-    float gloss = 0.0;
-    for (int i = 0; i < 2; i++) {
-        float slope = dot(n, light_ways[i]);
-        light += light_colours[i] * max((slope + WRAP) / (1.0 + WRAP), 0.0);
-        float half_slope = max(dot(n, normalize(light_ways[i] + to_eye)), 0.0);
-        float two = half_slope * half_slope, four = two * two, eight = four * four;
-        float sharp = eight * eight * eight * eight;
-        gloss += light_colours[i].g * (0.30 * sharp * sharp + 0.10 * eight);
-    }
-    float grazing = 1.0 - max(dot(n, to_eye), 0.0);
-    vec3 rim = vec3(0.55, 0.20, 0.17) * grazing * grazing * grazing;
-    colour = vec4(sqrt(body * light + wet * (gloss * vec3(1.0, 0.95, 0.92) + 0.55 * rim * light)), 1.0);
+    float side = gl_FrontFacing ? 1.0 : -1.0;
+    float wet = gl_FrontFacing ? 1.0 : 0.3;
+    vec3 body = gl_FrontFacing ? tissue : inside;
+    if (by_value == 1 && gl_FrontFacing) body = value < 0.0 ? unknown : mix(near_colour, far_colour, value);
+    vec3 n = normalize(side * normal + vec3(bumps.xy, 0.0) * 0.30 * wet);
+    body *= body * (1.0 + 0.7 * bumps.z);
+    vec3 key = light_colours[0] * max((dot(n, light_ways[0]) + WRAP) / (1.0 + WRAP), 0.0);
+    vec3 fill = light_colours[1] * max((dot(n, light_ways[1]) + WRAP) / (1.0 + WRAP), 0.0);
+    vec3 light = ambient * (0.7 + 0.3 * n.y) + key + fill;
+    float slope = max(dot(n, between), 0.0);
+    float eight = slope * slope; eight *= eight; eight *= eight;
+    float sharp = eight * eight; sharp *= sharp; sharp *= sharp;
+    float gloss = 0.34 * sharp + 0.09 * eight;
+    float grazing = 1.0 - max(n.z, 0.0);
+    vec3 rim = vec3(0.50, 0.17, 0.15) * grazing * grazing * grazing;
+    colour = vec4(sqrt(body * light + wet * (gloss + rim * light)), 1.0);
 }
 """
 
 GHOST_FRAGMENT = """
 #version 330
 uniform vec3 tint;
-in vec3 place;
 in vec3 normal;
 out vec4 colour;
 void main() {
-    float facing = abs(dot(normalize(normal), normalize(place)));
-    float edge = 1.0 - facing;
+    float edge = 1.0 - abs(normalize(normal).z);
     colour = vec4(tint, 0.10 + 0.55 * edge * edge);
 }
-"""
-
-GROUND_FRAGMENT = """
-#version 330
-uniform vec3 top;
-uniform vec3 bottom;
-uniform float height;
-out vec4 colour;
-void main() { colour = vec4(mix(bottom, top, gl_FragCoord.y / height), 1.0); }
 """
 
 CUT_VERTEX = """
@@ -162,11 +145,11 @@ void main() { colour = vec4(1.0); }
 INSIDE_FRAGMENT = """
 #version 330
 uniform sampler2D cut;         // 1 inside the outline
-uniform vec2 corner;           // lower left of the panel, pixels from below
+uniform vec4 panel;            // lower left corner, pixels from below, and size
 uniform vec3 tint;
 out vec4 colour;
 void main() {
-    vec2 at = (gl_FragCoord.xy - corner) / vec2(textureSize(cut, 0));
+    vec2 at = (gl_FragCoord.xy - panel.xy) / panel.zw;
     float inside = texture(cut, at).r;
     if (inside == 0.0) discard;
     colour = vec4(tint * (0.72 + 0.34 * at.y), inside);

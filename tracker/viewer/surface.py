@@ -22,6 +22,9 @@ from .shaders import (
 if TYPE_CHECKING:
     import moderngl
 
+GRAIN_MM = 24.0  # so far apart the grain of the surface repeats
+RADIUS_MM = 28.0  # of a tongue, roughly
+
 
 class SurfacePrograms:
     """What all surfaces of one model share: programmes, faces, and which faces surround each vertex."""
@@ -37,10 +40,7 @@ class SurfacePrograms:
             (TEXTURE_WIDTH, self.rows * len(pairs)), 2, self.layers(pairs, fill=-1).tobytes(), dtype="i4"
         )
         self.faces = context.buffer(np.ascontiguousarray(model.faces, dtype="i4").tobytes())
-        rest = model.mean_vertices()
-        # Grain lies on the surface as on a sheet unrolled from tip to root.
-        skin = np.column_stack([rest[:, 0], rest[:, 1] - rest[:, 2]]) / GRAIN_MM
-        self.skin = context.buffer(skin.astype("f4").tobytes())
+        self.skin = context.buffer(unrolled(model.mean_vertices()).astype("f4").tobytes())
         for program in (self.positions, self.normals):
             program["rows"] = self.rows
         self.positions["shapes"], self.positions["weights"] = 0, 1
@@ -56,10 +56,6 @@ class SurfacePrograms:
     def release(self) -> None:
         for thing in (self.positions, self.normals, self.ring, self.faces, self.skin):
             thing.release()
-
-
-GRAIN_MM = 26.0
-"""So far apart the grain of the surface repeats."""
 
 
 class Surface:
@@ -142,6 +138,15 @@ def tongue_vertex_array(
     program = context.program(TONGUE_VERTEX, fragment_shader=fragment_shader)
     parts = [(programs.skin, "2f", "in_skin")] if "in_skin" in program else []
     return program, context.vertex_array(program, parts, index_buffer=programs.faces, index_element_size=4)
+
+
+def unrolled(vertices: FloatArray) -> FloatArray:
+    """(V, 2) where each vertex (V, 3) lies in the grain, which repeats every 1: the surface seen from its middle, laid
+    flat by Lambert's projection, which keeps areas; it tears only below, where a tongue is open."""
+    away = vertices - 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    flat = away[:, :2] * np.sqrt(2.0 / np.maximum(1.0 + away[:, 2:], 1e-3))
+    return np.asarray(flat * RADIUS_MM / GRAIN_MM)
 
 
 def ring_pairs(faces: IndexArray, vertex_count: int) -> NDArray[np.int32]:
