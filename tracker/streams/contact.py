@@ -18,7 +18,7 @@ from .shapes import contour_with_parts
 REGIONS = {"tip": 0.06, "blade": 0.18, "front": 0.33, "body": 0.48, "back": 0.65}
 """Region of the contour -> the part of its length, from the tip, where it ends. Behind the last, the tongue faces the
 throat."""
-STEP_MM = 0.5
+STEP_MM = 1.0
 """Points of the palate's trace that are closer than this to the one before are left out: sweeps have thousands."""
 
 
@@ -92,10 +92,11 @@ def segments_of(palate: FloatArray) -> Segments:
 def gaps_below(points: FloatArray, palate: Segments) -> FloatArray:
     """(c,) mm: distance of points (c, 2), y and z, from the curve; negative above it; NaN for a point whose nearest one
     is the curve's front or back end: what is beyond was not traced."""
-    offset = points[:, None, :] - palate.start  # (c, s, 2)
-    part = np.clip((offset * palate.step).sum(axis=2) / palate.lengths2, 0.0, 1.0)
-    away = offset - part[..., None] * palate.step
-    distances2 = (away**2).sum(axis=2)
+    offset_y = points[:, :1] - palate.start[:, 0]  # (c, s)
+    offset_z = points[:, 1:] - palate.start[:, 1]
+    step_y, step_z = palate.step[:, 0], palate.step[:, 1]
+    part = np.minimum(np.maximum((offset_y * step_y + offset_z * step_z) / palate.lengths2, 0.0), 1.0)
+    distances2 = (offset_y - part * step_y) ** 2 + (offset_z - part * step_z) ** 2
     nearest = distances2.argmin(axis=1)
     rows = np.arange(len(points))
     at = part[rows, nearest]

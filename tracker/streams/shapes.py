@@ -187,6 +187,7 @@ STATIONS = {"blade": 0.12, "front": 0.25, "body": 0.40, "back": 0.55}
 SECTIONS = 3  # the first of the stations have edges
 HALFWAY, EDGE = 0.45, 0.85  # of the half width of the surface that faces up
 SLICE_MM = 2.0  # a section is looked for so far before and behind its station
+NARROWEST_MM = 3.0  # a surface that reaches less far to the side has no edge
 FACING_UP = 0.5  # cosine of the normal's angle to the section's own up
 
 # Rows of the landmark model: the tip, the middles, then left and right of each section.
@@ -250,7 +251,7 @@ def _section(
     back = np.array([0.0, *backwards]) / np.linalg.norm(backwards)
     up = np.array([0.0, -back[2], back[1]])
     from_middle = vertices - vertices[middle]
-    near = (np.abs(from_middle @ back) <= SLICE_MM) & (vertices[:, 0] > 0)
+    near = (np.abs(from_middle @ back) <= SLICE_MM) & (from_middle[:, 0] >= NARROWEST_MM)
     facing = near & (normals @ up >= FACING_UP)
     found = np.flatnonzero(facing if facing.any() else near)
     if not len(found):
