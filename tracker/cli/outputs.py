@@ -28,8 +28,8 @@ def add_output_flags(parser: argparse.ArgumentParser) -> None:
                         help=f"send our own OSC there; may be given several times (default {DEFAULT_OSC}, unless "
                         "--to says otherwise)")  # fmt: skip
     parser.add_argument("--to", metavar="TARGET", action="append", default=[],
-                        help="stream there as well: osc://HOST:PORT, vmc://HOST:PORT, vrchat://HOST:PORT, json://HOST:PORT, "
-                        "lsl:NAME, each with ?rate=HZ and more, see docs/streams.md; may be given several times")  # fmt: skip
+                        help="stream there as well: osc://HOST:PORT, vmc://HOST, vrchat://HOST, json://HOST, lsl:NAME, "
+                        "oscquery://HOST, most with ?rate=HZ and more, see docs/streams.md; may be given several times")  # fmt: skip
     parser.add_argument("--view", action="store_true", help="show the tongue in a window (extra 'viewer')")
     parser.add_argument("--web", metavar="HOST:PORT", nargs="?", const=DEFAULT_PAGE,
                         help=f"show the tongue on a page for browsers (default {DEFAULT_PAGE}; extra 'web')")  # fmt: skip

@@ -250,9 +250,8 @@ def _options(text: str, kind: TargetKind, query: str) -> dict[str, str]:
         raise InputError(f"'{text}': an option stands there twice.")
     for name in options:
         if name not in kind.options:
-            raise InputError(
-                f"'{text}': {kind.scheme} has no option '{name}'; expected {', '.join(kind.options)}."
-            )
+            known = f"expected {', '.join(kind.options)}" if kind.options else "it has none"
+            raise InputError(f"'{text}': {kind.scheme} has no option '{name}'; {known}.")
     return options
 
 
