@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..streams.page.server import DEFAULT_ADDRESS as DEFAULT_PAGE
 from .names import BUNDLED
 
 if TYPE_CHECKING:
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from ..streams.targets import Target
 
 DEFAULT_OSC = "127.0.0.1:9000"
+DEFAULT_PAGE = "127.0.0.1:8080"
 
 
 def add_output_flags(parser: argparse.ArgumentParser) -> None:

@@ -122,7 +122,7 @@ def parse_target(text: str) -> Target:
     kind = next((kind for kind in KINDS if kind.scheme == scheme.lower()), None)
     if kind is None or not colon or len(text) > MAX_TARGET_LENGTH or not text.isprintable():
         forms = ", ".join(kind.form for kind in KINDS)
-        raise InputError(f"'{text:.80}': this is no target; expected one of {forms}.")
+        raise InputError(f"{text[:80]!r}: this is no target; expected one of {forms}.")
     place, _, query = rest.partition("?")
     options = _options(text, kind, query)
     host, port, name = _place(text, kind, place)
