@@ -29,13 +29,9 @@ from .markings import Legend, Markings, Section, Trails
 from .overlay import MarkDrawer, Typeface
 from .scene import Moment, Scene, palate_distance, vertex_uncertainty, weights_covariance
 from .shaders import (
-    CUT_FRAGMENT,
-    CUT_VERTEX,
     GHOST_FRAGMENT,
-    INSIDE_FRAGMENT,
     TEXTURE_WIDTH,
     TONGUE_FRAGMENT,
-    WHOLE_VERTEX,
 )
 from .surface import Surface, SurfacePrograms, tongue_vertex_array
 
@@ -63,11 +59,6 @@ class Renderer:
         self._tongue, self._ghost = (Surface(self._programs, followed) for _ in range(2))
         self._tongue_program, self._tongue_array = tongue_vertex_array(self._programs, TONGUE_FRAGMENT)
         self._ghost_program, self._ghost_array = tongue_vertex_array(self._programs, GHOST_FRAGMENT)
-        self._cut_program = context.program(CUT_VERTEX, fragment_shader=CUT_FRAGMENT)
-        self._cut_points = context.buffer(reserve=8 * len(scene.outline.shares), dynamic=True)
-        self._cut_array = context.vertex_array(self._cut_program, [(self._cut_points, "2f", "in_place")])
-        self._inside_program = context.program(WHOLE_VERTEX, fragment_shader=INSIDE_FRAGMENT)
-        self._inside_array = context.vertex_array(self._inside_program, [])
         self._values = context.texture((TEXTURE_WIDTH, self._programs.rows), 1, dtype="f4")
         self._values.filter = (context.NEAREST, context.NEAREST)
         self._grain = context.texture((GRAIN_PX, GRAIN_PX), 4, grain().tobytes())
@@ -76,7 +67,6 @@ class Renderer:
         self._coloured_by: object = None
         self._most_unknown = 1.0
         self._typeface: Typeface | None = None
-        self._inside: moderngl.Framebuffer | None = None
         self._set_constants()
         self.resize(size)
 
@@ -89,12 +79,7 @@ class Renderer:
                 self._typeface.release()
             self._typeface = Typeface(self._context, self.layout.font_px)
         self._markings = Markings(self.scene, self.look, self.layout, self._typeface)
-        self._release_inside()
-        flat = self.layout.flat
-        # Half as fine as the picture: the contour's line covers its edge.
-        texture = self._context.texture((-(-flat.width // 2), -(-flat.height // 2)), 1, alignment=1)
-        self._inside = self._context.framebuffer([texture])
-        self._flat_projection = flat_projection(self.scene, flat, 2.2 * self.layout.font_px)
+        self._flat_projection = flat_projection(self.scene, self.layout.flat, 2.2 * self.layout.font_px)
 
     def remember(self, moment: Moment) -> None:
         """Lets the coils' trails pass here. `draw` does it itself; for a single picture of a later moment, the
@@ -119,14 +104,11 @@ class Renderer:
         ghost = None if view.ghost is None else self._section(self._ghost)
         context = self._context
         self._draw_tongue(framebuffer, view, solid, legend is not None)
-        # A software rasteriser starts on the tongue when the target changes; meanwhile the marks are put together.
-        self._fill_inside(tongue.outline)
         trails = self._trails(moment, view)
         in_space = self._markings.in_space(moment, solid, tongue, trails)
         in_plane = self._markings.in_plane(moment, self._flat_projection, tongue, ghost, trails)
         around = self._markings.around(moment, view, solid, self._flat_projection, legend)
 
-        framebuffer.use()
         context.enable(context.BLEND)
         context.blend_func = context.SRC_ALPHA, context.ONE_MINUS_SRC_ALPHA
         self._limit(framebuffer, self.layout.solid)
@@ -135,7 +117,6 @@ class Renderer:
         self._draw_marks(in_space)
         context.disable(context.DEPTH_TEST)
         self._limit(framebuffer, self.layout.flat)
-        self._draw_inside(framebuffer)
         self._draw_marks(in_plane)
         self._limit(framebuffer, None)
         self._draw_marks(around)
@@ -179,31 +160,6 @@ class Renderer:
         tongue.positions.use(0)
         tongue.normals.use(1)
         array.render()
-
-    def _fill_inside(self, outline: FloatArray) -> None:
-        """1 inside the cut, closed by a straight line, 0 outside: every triangle of a fan turns its pixels round, and
-        those inside a polygon are turned an odd number of times."""
-        assert self._inside is not None
-        flat = self.layout.flat
-        points = self._flat_projection.pixels(outline)[:, :2] - (flat.x, flat.y)
-        self._cut_points.write(points.astype("f4").tobytes())
-        context = self._context
-        self._inside.use()
-        self._inside.clear()
-        context.disable(context.DEPTH_TEST | context.CULL_FACE)
-        context.enable(context.BLEND)
-        context.blend_func = context.ONE_MINUS_DST_COLOR, context.ZERO
-        self._cut_program["size"] = (flat.width, flat.height)
-        self._cut_array.render(context.TRIANGLE_FAN)
-
-    def _draw_inside(self, framebuffer: moderngl.Framebuffer) -> None:
-        assert self._inside is not None
-        panel = self._from_below(self.layout.flat)
-        self._inside.color_attachments[0].use(0)
-        self._inside_program["panel"] = panel
-        framebuffer.viewport = panel
-        self._inside_array.render(vertices=3)
-        framebuffer.viewport = (0, 0, *self.size)
 
     def _draw_marks(self, rows: NDArray[np.float32]) -> None:
         assert self._typeface is not None
@@ -271,22 +227,15 @@ class Renderer:
         tongue["between"] = tuple(between / np.linalg.norm(between))
         ghost = self._ghost_program
         ghost["positions"], ghost["normals"], ghost["tint"] = 0, 1, look.ghost
-        self._inside_program["cut"], self._inside_program["tint"] = 0, look.flat
-
-    def _release_inside(self) -> None:
-        if self._inside is not None:
-            self._inside.color_attachments[0].release()
-            self._inside.release()
 
     def release(self) -> None:
         """Gives everything on the graphics card back."""
-        self._release_inside()
         if self._typeface is not None:
             self._typeface.release()
         things = (
             self._drawer, self._tongue, self._ghost, self._tongue_array, self._ghost_array,
-            self._cut_array, self._inside_array, self._cut_points, self._values, self._grain, self._tongue_program,
-            self._ghost_program, self._cut_program, self._inside_program, self._programs,
+            self._values, self._grain, self._tongue_program,
+            self._ghost_program, self._programs,
         )  # fmt: skip
         for thing in things:
             thing.release()

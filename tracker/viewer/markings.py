@@ -43,6 +43,25 @@ class Legend:
     high: float
 
 
+def spans(polygon: FloatArray, top: int, bottom: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The inside of a closed polygon (s, 2) row by row: rows (r,), and from where to where (r,), pixels.
+
+    A point is inside where a line from it crosses the edges an odd number of times; a row has as many spans as it
+    has pieces inside. Rows from `top` to before `bottom` only.
+    """
+    first, second = polygon, np.roll(polygon, -1, axis=0)
+    rows = np.arange(
+        max(top, int(polygon[:, 1].min())), min(bottom, int(polygon[:, 1].max()) + 1), dtype=np.float64
+    )
+    middle = rows[:, None] + 0.5
+    crossed = (first[:, 1] <= middle) != (second[:, 1] <= middle)  # (rows, s)
+    row, edge = np.nonzero(crossed)
+    (x, y), (to_x, to_y) = first[edge].T, second[edge].T
+    at = x + (rows[row] + 0.5 - y) * (to_x - x) / (to_y - y)
+    order = np.lexsort((at, row))
+    return rows[row[order][::2]], at[order][::2], at[order][1::2]
+
+
 class Markings:
     """Makes the rows of marks of one picture after the other, in one layout."""
 
@@ -72,15 +91,23 @@ class Markings:
     ) -> NDArray[np.float32]:
         """On the mid-sagittal cut."""
         look, stroke = self._look, self._stroke
+        outline = projection.pixels(tongue.outline)
+        self._fill(outline)
         if self._scene.palate is not None:
             self._marks.polyline(projection.pixels(self._scene.palate), 2 * stroke, look.palate)
         if ghost is not None:
             self._marks.polyline(projection.pixels(ghost.outline), 1.6 * stroke, look.ghost, 0.9)
-        outline = projection.pixels(tongue.outline)
         self._marks.polyline(outline[[-1, 0]], stroke, look.contour, 0.35)  # where the mesh is open
         self._marks.polyline(outline, 2 * stroke, look.contour)
         self._coils(moment, projection, tongue.feet, trails)
         return self._marks.taken()
+
+    def _fill(self, outline: FloatArray) -> None:
+        """The cut's inside, paler above; closed by a straight line where the mesh is open."""
+        area = self._layout.flat
+        rows, left, right = spans(outline[:, :2], area.y, area.y + area.height)
+        shade = 1.06 - 0.34 * (rows - area.y) / area.height
+        self._marks.bars(left, rows, right, rows + 1.0, np.clip(np.outer(shade, self._look.flat), 0.0, 1.0))
 
     def around(
         self, moment: Moment, view: View, solid: Projection, flat: Projection, legend: Legend | None

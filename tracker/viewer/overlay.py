@@ -162,14 +162,29 @@ class Marks:
         rows[:, 8:11], rows[:, 11] = colours, 1.0
         self._parts.append(rows[np.isfinite(rows).all(axis=1)])
 
+    def bars(
+        self,
+        left: FloatArray,
+        top: FloatArray,
+        right: FloatArray,
+        bottom: FloatArray,
+        colours: FloatArray,
+        alpha: float = 1.0,
+    ) -> None:
+        """Filled rectangles, n of each; colours: (3,) or (n, 3)."""
+        rows = np.zeros((len(left), COLUMNS), dtype=np.float32)
+        rows[:, 0] = BAR
+        rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4] = left, top, right, bottom
+        rows[:, 5:7] = NEAREST_DEPTH
+        rows[:, 8:11], rows[:, 11] = colours, alpha
+        self._parts.append(rows)
+
     def bar(
         self, left: float, top: float, right: float, bottom: float, colour: Colour, alpha: float = 1.0
     ) -> None:
-        row = np.zeros((1, COLUMNS), dtype=np.float32)
-        row[0, :5] = BAR, left, top, right, bottom
-        row[0, 5:7] = NEAREST_DEPTH
-        row[0, 8:12] = *colour, alpha
-        self._parts.append(row)
+        """One filled rectangle."""
+        corners = np.array([[left], [top], [right], [bottom]])
+        self.bars(*corners, np.array(colour), alpha)
 
     def text(self, x: float, y: float, text: str, colour: Colour) -> None:
         """One line; x, y: the upper left corner."""

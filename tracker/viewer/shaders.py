@@ -62,16 +62,25 @@ uniform sampler2D normals;
 uniform sampler2D values;      // what the vertices are coloured by, 0 to 1, negative = unknown
 uniform mat4 to_clip;
 uniform mat3 to_camera;
+uniform int by_value;
+uniform vec3 tissue;
+uniform vec3 near_colour;
+uniform vec3 far_colour;
+uniform vec3 unknown;
 in vec2 in_skin;
 out vec3 normal;
+out vec3 body;
 out vec2 skin;
-out float value;
 void main() {
     ivec2 at = ivec2(gl_VertexID % WIDTH, gl_VertexID / WIDTH);
-    vec4 here = vec4(texelFetch(positions, at, 0).xyz, 1.0);
-    gl_Position = to_clip * here;
+    gl_Position = to_clip * vec4(texelFetch(positions, at, 0).xyz, 1.0);
     normal = to_camera * texelFetch(normals, at, 0).xyz;
-    value = texelFetch(values, at, 0).x;
+    body = tissue;
+    if (by_value == 1) {
+        float value = texelFetch(values, at, 0).x;
+        body = value < 0.0 ? unknown : mix(near_colour, far_colour, value);
+    }
+    body *= body;
     skin = in_skin;
 }
 """.replace("WIDTH", str(TEXTURE_WIDTH))
@@ -82,39 +91,32 @@ void main() {
 TONGUE_FRAGMENT = """
 #version 330
 uniform sampler2D grain;       // two slopes and a tint
-uniform vec3 tissue;
 uniform vec3 inside;
-uniform vec3 near_colour;
-uniform vec3 far_colour;
-uniform vec3 unknown;
-uniform int by_value;
 uniform vec3 ambient;
 uniform vec3 light_ways[2];
 uniform vec3 light_colours[2];
 uniform vec3 between;          // half way between the first light and the eye
 in vec3 normal;
+in vec3 body;
 in vec2 skin;
-in float value;
 out vec4 colour;
 const vec3 WRAP = vec3(0.42, 0.16, 0.13);
+const vec3 SHARE = 1.0 / (1.0 + WRAP);
 void main() {
     vec3 bumps = texture(grain, skin).xyz - 0.5;
-    float side = gl_FrontFacing ? 1.0 : -1.0;
+    vec3 facing = gl_FrontFacing ? normal : -normal;
+    vec3 own = gl_FrontFacing ? body : inside * inside;
     float wet = gl_FrontFacing ? 1.0 : 0.3;
-    vec3 body = gl_FrontFacing ? tissue : inside;
-    if (by_value == 1 && gl_FrontFacing) body = value < 0.0 ? unknown : mix(near_colour, far_colour, value);
-    vec3 n = normalize(side * normal + vec3(bumps.xy, 0.0) * 0.30 * wet);
-    body *= body * (1.0 + 0.7 * bumps.z);
-    vec3 key = light_colours[0] * max((dot(n, light_ways[0]) + WRAP) / (1.0 + WRAP), 0.0);
-    vec3 fill = light_colours[1] * max((dot(n, light_ways[1]) + WRAP) / (1.0 + WRAP), 0.0);
-    vec3 light = ambient * (0.7 + 0.3 * n.y) + key + fill;
+    vec3 n = normalize(facing + vec3(0.30 * bumps.xy, 0.0));
+    vec3 light = ambient * (0.7 + 0.3 * n.y)
+        + light_colours[0] * max((dot(n, light_ways[0]) + WRAP) * SHARE, 0.0)
+        + light_colours[1] * max((dot(n, light_ways[1]) + WRAP) * SHARE, 0.0);
     float slope = max(dot(n, between), 0.0);
     float eight = slope * slope; eight *= eight; eight *= eight;
     float sharp = eight * eight; sharp *= sharp; sharp *= sharp;
-    float gloss = 0.34 * sharp + 0.09 * eight;
     float grazing = 1.0 - max(n.z, 0.0);
-    vec3 rim = vec3(0.50, 0.17, 0.15) * grazing * grazing * grazing;
-    colour = vec4(sqrt(body * light + wet * (gloss + rim * light)), 1.0);
+    vec3 rim = vec3(0.50, 0.17, 0.15) * (grazing * grazing * grazing);
+    colour = vec4(sqrt(light * (own * (1.0 + 0.7 * bumps.z) + wet * rim) + wet * (0.38 * sharp + 0.10 * eight)), 1.0);
 }
 """
 
@@ -126,33 +128,6 @@ out vec4 colour;
 void main() {
     float edge = 1.0 - abs(normalize(normal).z);
     colour = vec4(tint, 0.10 + 0.55 * edge * edge);
-}
-"""
-
-CUT_VERTEX = """
-#version 330
-uniform vec2 size;
-in vec2 in_place;              // pixels of the panel
-void main() { gl_Position = vec4(2.0 * in_place.x / size.x - 1.0, 1.0 - 2.0 * in_place.y / size.y, 0.0, 1.0); }
-"""
-
-CUT_FRAGMENT = """
-#version 330
-out vec4 colour;
-void main() { colour = vec4(1.0); }
-"""
-
-INSIDE_FRAGMENT = """
-#version 330
-uniform sampler2D cut;         // 1 inside the outline
-uniform vec4 panel;            // lower left corner, pixels from below, and size
-uniform vec3 tint;
-out vec4 colour;
-void main() {
-    vec2 at = (gl_FragCoord.xy - panel.xy) / panel.zw;
-    float inside = texture(cut, at).r;
-    if (inside == 0.0) discard;
-    colour = vec4(tint * (0.72 + 0.34 * at.y), inside);
 }
 """
 
@@ -183,7 +158,8 @@ void main() {
         float far = length(along);
         along = far > 0.0 ? along / far : vec2(1.0, 0.0);
         vec2 aside = vec2(-along.y, along.x);
-        at = mix(first - along * reach, second + along * reach, corner.x) + aside * reach * (2.0 * corner.y - 1.0);
+        // Hardly longer than it is, so that the pieces of a curve do not show where they meet.
+        at = mix(first - along * 0.3, second + along * 0.3, corner.x) + aside * reach * (2.0 * corner.y - 1.0);
         depth = mix(in_depths.x, in_depths.y, corner.x);
     } else if (kind == 1) {
         at = first + (in_thickness + 1.0) * (2.0 * corner - 1.0);
