@@ -12,12 +12,21 @@ from numpy.typing import ArrayLike, NDArray
 from ... import InputError
 from ..pose import FloatArray
 from .look import Colour
-from .shaders import MARK_FRAGMENT, MARK_VERTEX
+from .shaders import (
+    BALL_FRAGMENT,
+    BALL_VERTEX,
+    BAR_FRAGMENT,
+    LETTER_FRAGMENT,
+    LINE_FRAGMENT,
+    LINE_VERTEX,
+    RECTANGLE_VERTEX,
+)
 
 if TYPE_CHECKING:
     import moderngl
 
-LINE, BALL, LETTER, BAR = range(4)
+BAR, LINE, BALL, LETTER = range(4)
+"""The kinds of marks, in the order in which they are drawn."""
 COLUMNS = 16
 """kind, ends (4), depths (2), thickness, colour (4), corners in the atlas (4)."""
 ATLAS_PX = 512
@@ -118,7 +127,7 @@ def plain_letters(text: str) -> str:
 
 
 class Marks:
-    """A list of marks in drawing order. Positions are pixels from the upper left, with a depth where it matters."""
+    """A list of marks; of one kind, the later are on top. Positions are pixels from the upper left, with a depth where it matters."""
 
     def __init__(self, typeface: Typeface) -> None:
         self.typeface = typeface
@@ -141,6 +150,7 @@ class Marks:
         colours: (3,) or (n, 3); alphas: one, or (n,).
         """
         rows = np.zeros((len(first), COLUMNS), dtype=np.float32)
+        rows[:, 0] = LINE
         rows[:, 1:3], rows[:, 3:5] = first[:, :2], second[:, :2]
         rows[:, 5], rows[:, 6] = first[:, 2], second[:, 2]
         rows[:, 7] = thickness
@@ -202,34 +212,63 @@ class Marks:
 
 
 class MarkDrawer:
-    """Draws rows of marks with one call."""
+    """Draws rows of marks, one call for each kind."""
 
     def __init__(self, context: moderngl.Context) -> None:
+        self._kinds = {
+            BAR: MarkKind(context, RECTANGLE_VERTEX, BAR_FRAGMENT),
+            LINE: MarkKind(context, LINE_VERTEX, LINE_FRAGMENT),
+            BALL: MarkKind(context, BALL_VERTEX, BALL_FRAGMENT),
+            LETTER: MarkKind(context, RECTANGLE_VERTEX, LETTER_FRAGMENT),
+        }
+
+    def draw(self, rows: NDArray[np.float32], size: tuple[int, int], atlas: moderngl.Texture) -> None:
+        """rows: (n, COLUMNS); size: of the picture, pixels."""
+        atlas.use(0)
+        for kind, drawer in self._kinds.items():
+            chosen = rows[rows[:, 0] == kind]
+            if len(chosen):
+                drawer.draw(chosen, size)
+
+    def release(self) -> None:
+        for drawer in self._kinds.values():
+            drawer.release()
+
+
+class MarkKind:
+    """The programme of one kind of marks, and a buffer that grows with their number."""
+
+    def __init__(self, context: moderngl.Context, vertex_shader: str, fragment_shader: str) -> None:
         self._context = context
-        self._program = context.program(MARK_VERTEX, fragment_shader=MARK_FRAGMENT)
-        self._program["letters"] = 0
+        self._program = context.program(vertex_shader, fragment_shader=fragment_shader)
         self._buffer: moderngl.Buffer | None = None
         self._array: moderngl.VertexArray | None = None
         self._room = 0
 
-    def draw(self, rows: NDArray[np.float32], size: tuple[int, int], atlas: moderngl.Texture) -> None:
-        """rows: (n, COLUMNS); size: of the picture, pixels."""
-        if not len(rows):
-            return
+    def draw(self, rows: NDArray[np.float32], size: tuple[int, int]) -> None:
         if len(rows) > self._room:
             self._make_room(2 * len(rows))
         assert self._buffer is not None and self._array is not None
-        self._buffer.write(np.ascontiguousarray(rows, dtype="f4").tobytes())
+        self._buffer.write(rows.tobytes())
         self._program["size"] = size
-        atlas.use(0)
         self._array.render(self._context.TRIANGLE_STRIP, vertices=4, instances=len(rows))
 
     def _make_room(self, rows: int) -> None:
         self._release_buffer()
         self._buffer = self._context.buffer(reserve=4 * COLUMNS * rows, dynamic=True)
-        names = ("in_kind", "in_ends", "in_depths", "in_thickness", "in_colour", "in_letter")
+        layout, names = ["4x"], []
+        for name, part in (
+            ("in_ends", 4),
+            ("in_depths", 2),
+            ("in_thickness", 1),
+            ("in_colour", 4),
+            ("in_letter", 4),
+        ):
+            used = name in self._program
+            layout.append(f"{part}f" if used else f"{4 * part}x")
+            names += [name] if used else []
         self._array = self._context.vertex_array(
-            self._program, [(self._buffer, "1f 4f 2f 1f 4f 4f /i", *names)]
+            self._program, [(self._buffer, " ".join([*layout, "/i"]), *names)]
         )
         self._room = rows
 

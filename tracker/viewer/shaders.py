@@ -131,78 +131,113 @@ void main() {
 }
 """
 
-# Marks: lines, balls, letters and bars, each a quadrilateral in pixels with edges softened over one pixel.
-MARK_VERTEX = """
+# Marks: bars, lines, balls and letters, each a quadrilateral in pixels with edges softened over one pixel. One programme
+# each: a software rasteriser would take every branch of a common one in every pixel.
+_MARK_HEAD = """
 #version 330
 uniform vec2 size;
-in float in_kind;
 in vec4 in_ends;               // two points, pixels from the upper left
 in vec2 in_depths;
 in float in_thickness;         // of a line; radius of a ball
 in vec4 in_colour;
 in vec4 in_letter;             // corners in the atlas
-flat out int kind;
 flat out vec4 ends;
 flat out float thickness;
 flat out vec4 tint;
 out vec2 at;
 out vec2 letter;
-void main() {
-    vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1);
-    vec2 first = in_ends.xy, second = in_ends.zw;
-    kind = int(in_kind);
-    float depth = in_depths.x;
-    if (kind == 0) {
-        float reach = 0.5 * in_thickness + 1.0;
-        vec2 along = second - first;
-        float far = length(along);
-        along = far > 0.0 ? along / far : vec2(1.0, 0.0);
-        vec2 aside = vec2(-along.y, along.x);
-        // Hardly longer than it is, so that the pieces of a curve do not show where they meet.
-        at = mix(first - along * 0.3, second + along * 0.3, corner.x) + aside * reach * (2.0 * corner.y - 1.0);
-        depth = mix(in_depths.x, in_depths.y, corner.x);
-    } else if (kind == 1) {
-        at = first + (in_thickness + 1.0) * (2.0 * corner - 1.0);
-    } else {
-        at = mix(first, second, corner);
-    }
-    letter = mix(in_letter.xy, in_letter.zw, corner);
+void put(vec2 place, float depth) {
+    at = place;
     ends = in_ends;
     thickness = in_thickness;
     tint = in_colour;
+    letter = vec2(0.0);
     gl_Position = vec4(2.0 * at.x / size.x - 1.0, 1.0 - 2.0 * at.y / size.y, depth, 1.0);
 }
 """
 
-MARK_FRAGMENT = """
+RECTANGLE_VERTEX = (
+    _MARK_HEAD
+    + """
+void main() {
+    vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1);
+    put(mix(in_ends.xy, in_ends.zw, corner), in_depths.x);
+    letter = mix(in_letter.xy, in_letter.zw, corner);
+}
+"""
+)
+
+BAR_FRAGMENT = """
+#version 330
+flat in vec4 tint;
+out vec4 colour;
+void main() { colour = tint; }
+"""
+
+LETTER_FRAGMENT = """
 #version 330
 uniform sampler2D letters;
-flat in int kind;
+flat in vec4 tint;
+in vec2 letter;
+out vec4 colour;
+void main() { colour = vec4(tint.rgb, tint.a * texture(letters, letter).r); }
+"""
+
+# Hardly longer than it is, so that the pieces of a curve do not show where they meet.
+LINE_VERTEX = (
+    _MARK_HEAD
+    + """
+void main() {
+    vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1);
+    vec2 along = in_ends.zw - in_ends.xy;
+    float far = length(along);
+    along = far > 0.0 ? along / far : vec2(1.0, 0.0);
+    vec2 aside = vec2(-along.y, along.x) * (0.5 * in_thickness + 1.0) * (2.0 * corner.y - 1.0);
+    float depth = mix(in_depths.x, in_depths.y, corner.x);
+    put(mix(in_ends.xy - along * 0.3, in_ends.zw + along * 0.3, corner.x) + aside, depth);
+}
+"""
+)
+
+LINE_FRAGMENT = """
+#version 330
 flat in vec4 ends;
 flat in float thickness;
 flat in vec4 tint;
 in vec2 at;
-in vec2 letter;
 out vec4 colour;
 void main() {
-    if (kind == 2) {
-        colour = vec4(tint.rgb, tint.a * texture(letters, letter).r);
-    } else if (kind == 3) {
-        colour = tint;
-    } else if (kind == 1) {
-        vec2 off = at - ends.xy;
-        float far = length(off);
-        vec2 side = off / max(thickness, 1e-3);
-        float up = sqrt(max(1.0 - dot(side, side), 0.0));
-        float light = 0.45 + 0.6 * max(dot(vec3(side.x, -side.y, up), vec3(-0.42, 0.62, 0.66)), 0.0);
-        vec2 shine = side - vec2(-0.35, -0.42);
-        float gloss = 0.7 * max(1.0 - 7.0 * dot(shine, shine), 0.0);
-        colour = vec4(tint.rgb * light + gloss, tint.a * clamp(thickness + 0.5 - far, 0.0, 1.0));
-    } else {
-        vec2 along = ends.zw - ends.xy;
-        float share = clamp(dot(at - ends.xy, along) / max(dot(along, along), 1e-6), 0.0, 1.0);
-        float far = length(at - ends.xy - share * along);
-        colour = vec4(tint.rgb, tint.a * clamp(0.5 * thickness + 0.5 - far, 0.0, 1.0));
-    }
+    vec2 along = ends.zw - ends.xy;
+    float share = clamp(dot(at - ends.xy, along) / max(dot(along, along), 1e-6), 0.0, 1.0);
+    float far = length(at - ends.xy - share * along);
+    colour = vec4(tint.rgb, tint.a * clamp(0.5 * thickness + 0.5 - far, 0.0, 1.0));
+}
+"""
+
+BALL_VERTEX = (
+    _MARK_HEAD
+    + """
+void main() {
+    vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1);
+    put(in_ends.xy + (in_thickness + 1.0) * (2.0 * corner - 1.0), in_depths.x);
+}
+"""
+)
+
+BALL_FRAGMENT = """
+#version 330
+flat in vec4 ends;
+flat in float thickness;
+flat in vec4 tint;
+in vec2 at;
+out vec4 colour;
+void main() {
+    vec2 off = at - ends.xy;
+    vec2 side = off / max(thickness, 1e-3);
+    float up = sqrt(max(1.0 - dot(side, side), 0.0));
+    float light = 0.45 + 0.6 * max(dot(vec3(side.x, -side.y, up), vec3(-0.42, 0.62, 0.66)), 0.0);
+    vec2 shine = side - vec2(-0.35, -0.42);
+    float gloss = 0.7 * max(1.0 - 7.0 * dot(shine, shine), 0.0);
+    colour = vec4(tint.rgb * light + gloss, tint.a * clamp(thickness + 0.5 - length(off), 0.0, 1.0));
 }
 """
