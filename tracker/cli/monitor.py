@@ -22,8 +22,9 @@ def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]
     """Register `monitor`."""
     monitor = subparsers.add_parser(
         "monitor",
-        help="listen for OSC and print what arrives: rates, gaps, unknown addresses",
-        description="Listens for OSC and prints what arrives. Ctrl-C ends it with the summary and exit code 0.",
+        help="listen for OSC and print what arrives: rates, gaps, unknown addresses and names",
+        description="Listens for OSC, VMC or VRChat parameters and prints what arrives. Ctrl-C ends it with the summary "
+        "and exit code 0.",
     )
     monitor.add_argument(
         "--listen", metavar="HOST:PORT", default="127.0.0.1:9000", help="where to listen (%(default)s)"
@@ -32,6 +33,11 @@ def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]
     monitor.add_argument("--json", action="store_true", help="print the summary as JSON")
     monitor.add_argument(
         "--addresses", action="store_true", help="print what is sent where (docs/osc.md), and end"
+    )
+    monitor.add_argument(
+        "--protocols",
+        action="store_true",
+        help="print all protocols that poses leave by (docs/protocols.md), and end",
     )
     monitor.set_defaults(run=run_monitor)
 
@@ -43,16 +49,22 @@ def run_monitor(args: argparse.Namespace) -> int:
 
         print(protocol_page(), end="")
         return 0
+    if args.protocols:
+        from ..streams.protocols import protocols_page
+
+        print(protocols_page(), end="")
+        return 0
     import logging
     import socket
 
     from ..streams.monitor import Monitor
     from ..streams.osc import listening_socket
+    from ..streams.vocabularies import preset_vocabularies
 
     logging.getLogger().addHandler(logging.NullHandler())  # python-osc logs what we count
     receiver = listening_socket(args.listen, "--listen")
     receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-    monitor = Monitor(tell=_say)
+    monitor = Monitor(tell=_say, vocabularies=preset_vocabularies())
     _say(f"listening on {args.listen.rpartition(':')[0]}:{receiver.getsockname()[1]}; Ctrl-C ends")
     try:
         _listen(receiver, monitor, args.seconds)

@@ -7,12 +7,16 @@ Assistant adds a part of the face and sends to a Performer, by default at port 3
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ..pose import PoseStatus, TrackedPose
 from .addresses import Address, Argument
-from .avatar import AvatarValues
 from .packing import PackedBundle, in_datagrams, osc_message
 from .sink import StreamInfo
 from .udp import UdpSender
+
+if TYPE_CHECKING:
+    from .avatar import AvatarValues
 
 DEFAULT_DESTINATION = "127.0.0.1:39540"
 LOADED, CALIBRATED, NORMAL_MODE = 1, 3, 0

@@ -10,14 +10,17 @@ ExpressionTrackingActive switch such an avatar between tracking and its own anim
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
 
 from ... import InputError
 from ..pose import PoseStatus, TrackedPose
 from .addresses import Address, Argument
-from .avatar import AvatarValues
 from .packing import PackedBundle, in_datagrams, osc_message
 from .sink import StreamInfo
 from .udp import UdpSender
+
+if TYPE_CHECKING:
+    from .avatar import AvatarValues
 
 DEFAULT_DESTINATION = "127.0.0.1:9000"
 UNIFIED = "unified"
