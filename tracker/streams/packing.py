@@ -130,7 +130,8 @@ class NumbersMessage:
         return self._head + self._pack(*numbers)
 
 
-BUNDLE_HEADER = b"#bundle\0" + struct.pack(">Q", IMMEDIATELY)
+BUNDLE_HEADER = b"#bundle\0" + struct.pack(">Q", 1)
+"""1 is the time tag that means "immediately"."""
 
 
 def bundles_of(elements: Iterable[bytes], first: bytes) -> Iterator[bytes]:
