@@ -422,5 +422,7 @@ def _all_of(content: dict[str, Any], name: str, kind: type) -> list[Any]:
 
 def _numbers_from(encoded: bytes) -> FeedNumbers:
     content = json.loads(encoded)
-    live = {name: tuple(v) if isinstance(v, list) else v for name, v in content["live"].items()}
+    live: dict[str, Any] = {
+        name: tuple(v) if isinstance(v, list) else v for name, v in content["live"].items()
+    }
     return FeedNumbers(LiveNumbers(**live), tuple(content["troubles"]), content["text"])
