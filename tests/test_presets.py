@@ -1,12 +1,16 @@
 """Presets: complete vocabularies, honest mixtures, files that are checked."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tonguetrack import InputError
 from tonguetrack.tracker.bundled import bundled_model
+from tonguetrack.tracker.session import parse_session
 from tonguetrack.tracker.streams.presets import FORMAT, load_preset, parse_preset, preset_names
-from tonguetrack.tracker.streams.shapes import SHAPES, ShapeMeter, shape_names
+from tonguetrack.tracker.streams.shapes import AXES, SHAPES, ShapeMeter, shape_names
 
 NAMES = shape_names(4)
 
@@ -208,3 +212,35 @@ def test_every_shape_is_used_by_some_preset_or_is_ours_alone():
         "groove",
         "ridge",
     }
+
+
+# The page about them ----------------------------------------------------------------------------------
+
+PAGE = Path(__file__).parents[1] / "docs" / "shapes.md"
+
+
+def test_the_page_has_a_row_for_every_shape_and_for_every_name_of_a_preset():
+    rows = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+    units = {axis.name: axis for axis in AXES}
+    for shape in SHAPES:
+        axis = units[shape.axis]
+        assert (
+            f"| `{shape.name}` | {axis.unit} | {'yes' if axis.rigid else ''} | {shape.meaning} |" in rows
+        ), shape
+    for name in VOCABULARIES:
+        preset = load_preset(name)
+        for target in preset.targets:
+            found = [row for row in rows if row.startswith(f"| `{target.name}` |")]
+            assert len(found) == 1, target.name
+            assert re.findall(r"`([a-z_]+)`", found[0].split("|")[2]) == [shape for shape, _ in target.terms]
+            assert ("-1..1" in found[0]) == (target.low < 0)
+        for missing, reason in preset.undriven.items():
+            assert f"| `{missing}` | not sent: {reason} | |" in rows
+
+
+def test_the_pages_examples_are_a_session_and_a_preset():
+    ranges, preset = re.findall(
+        r"^```toml\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    ShapeMeter(bundled_model(), parse_session(ranges, "page").shape_ranges)
+    parse_preset(preset, "page").mixer(NAMES)

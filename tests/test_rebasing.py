@@ -58,7 +58,7 @@ def test_a_direction_that_never_moves_in_a_clip_has_weight_0_and_the_mesh_is_sti
     weights = np.random.default_rng(5).normal(size=(20, 3))
     weights[:, 1] = 0.7
     rebased = Rebased.of_clip(weights)
-    assert (rebased.to_unit(weights)[:, 1] == 0).all()
+    assert (rebased.to_unit(weights)[:, 1] == 0).all() and rebased.to_unit([0.0, 9.0, 0.0])[1] == 0
     assert not rebased.directions(speaker)[1].any()
     np.testing.assert_allclose(
         rebuilt(rebased, speaker, weights[4]), speaker.vertices(weights[4]), atol=1e-12
