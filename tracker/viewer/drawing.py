@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Renderer", "View", "home_view"]
 
-NEAR_PALATE_MM = 10.0  # from here on all distances look the same
+FAR_FROM_PALATE_MM = 10.0  # from here on all distances look the same
+UNCERTAIN_MM = 3.0  # likewise
 LONGEST_TRAIL_S = 10.0
 BROKEN_TRAIL_S = 0.25  # longer without a moment, and a trail does not bridge it
 TRAIL_STEP_S = 0.01
@@ -65,7 +66,6 @@ class Renderer:
         self._drawer = MarkDrawer(context)
         self._past: deque[tuple[float, FloatArray]] = deque()
         self._coloured_by: object = None
-        self._most_unknown = 1.0
         self._typeface: Typeface | None = None
         self._set_constants()
         self.resize(size)
@@ -184,40 +184,37 @@ class Renderer:
 
     def _colour(self, moment: Moment, view: View) -> Legend | None:
         """Brings the vertices' values up to date; None = the tongue has its own colour."""
+        look, tongue = self.look, self._tongue
         if view.colour_by == "palate" and self.scene.palate is not None:
-            key: object = ("palate", moment.weights.tobytes(), moment.speaker_weights.tobytes())
-            legend, values = Legend("to the palate", 0.0, NEAR_PALATE_MM), None
+            legend = Legend("to the palate", FAR_FROM_PALATE_MM, (look.near, look.far))
+            key: object = (view.colour_by, moment.weights.tobytes(), moment.speaker_weights.tobytes())
             if key != self._coloured_by:
-                values = palate_distance(self._tongue.vertices(), self.scene.palate) / NEAR_PALATE_MM
+                self._write_values(palate_distance(tongue.vertices(), self.scene.palate), legend)
         elif view.colour_by == "uncertainty":
-            seen = tuple(
-                vertex
-                for vertex, coil, state in zip(
-                    self.scene.correspondences, moment.coils, moment.coil_states, strict=True
-                )
-                if state == CoilState.TRUSTED and np.isfinite(coil).all()
-            )
-            key = ("uncertainty", seen, moment.speaker_weights.tobytes())
-            values = None
+            legend = Legend("uncertain (1 sigma)", UNCERTAIN_MM, (look.far, look.near))
+            seen = trusted_vertices(self.scene, moment)
+            key = (view.colour_by, seen, moment.speaker_weights.tobytes())
             if key != self._coloured_by:
-                speaker = self._tongue.speaker
-                self._most_unknown = float(vertex_uncertainty(speaker, weights_covariance(speaker, ())).max())
-                values = vertex_uncertainty(speaker, weights_covariance(speaker, seen)) / self._most_unknown
-            legend = Legend("one sigma of each vertex", 0.0, self._most_unknown)
+                covariance = weights_covariance(tongue.speaker, seen)
+                self._write_values(vertex_uncertainty(tongue.speaker, covariance), legend)
         else:
             return None
-        if values is not None:
-            clipped = np.where(np.isnan(values), -1.0, np.clip(values, 0.0, 1.0))
-            self._values.write(self._programs.layers(clipped.astype("f4")[None, :, None]).tobytes())
-            self._coloured_by = key
+        self._coloured_by = key
         return legend
+
+    def _write_values(self, values_mm: FloatArray, legend: Legend) -> None:
+        """values_mm: (V,), NaN = unknown."""
+        shares = np.where(np.isnan(values_mm), -1.0, np.clip(values_mm / legend.most_mm, 0.0, 1.0))
+        self._values.write(self._programs.layers(shares.astype("f4")[None, :, None]).tobytes())
+        program = self._tongue_program
+        program["near_colour"], program["far_colour"] = legend.colours
 
     def _set_constants(self) -> None:
         look = self.look
         tongue = self._tongue_program
         tongue["positions"], tongue["normals"], tongue["values"], tongue["grain"] = 0, 1, 2, 3
         tongue["tissue"], tongue["inside"] = look.tissue, look.inside
-        tongue["near_colour"], tongue["far_colour"], tongue["unknown"] = look.near, look.far, look.unknown
+        tongue["unknown"] = look.unknown
         tongue["ambient"] = look.ambient
         lights = (look.key, look.fill)
         ways = [np.array(light.direction) / np.linalg.norm(light.direction) for light in lights]
@@ -239,6 +236,12 @@ class Renderer:
         )  # fmt: skip
         for thing in things:
             thing.release()
+
+
+def trusted_vertices(scene: Scene, moment: Moment) -> tuple[int, ...]:
+    """The vertices whose coils had a part in the pose."""
+    coils = zip(scene.correspondences, moment.coils, moment.coil_states, strict=False)
+    return tuple(v for v, place, state in coils if state == CoilState.TRUSTED and np.isfinite(place).all())
 
 
 def faint(rows: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -23,7 +23,7 @@ class Light:
 
 
 NEAR = colour("d62f3a")
-"""A vertex at the palate, or one that is not known well."""
+"""A vertex at the palate, or one that is hardly known."""
 FAR = colour("3d6fd6")
 UNKNOWN = colour("8a8a8a")
 KEY = Light((-0.45, 0.75, 0.65), (1.0, 0.96, 0.9))
@@ -58,7 +58,7 @@ class Look:
     ambient: Colour = (0.20, 0.19, 0.21)
     ball_mm: float = 1.6
     font_share: float = 1 / 42  # of the picture's height
-    smallest_font_px: int = 11
+    smallest_font_px: int = 12
     largest_font_px: int = 24
 
 

@@ -36,11 +36,11 @@ class Trails:
 
 @dataclass(frozen=True)
 class Legend:
-    """What the vertices' colours stand for, from `low` to `high` mm."""
+    """What the vertices' colours stand for: from 0 mm, the first colour, to `most_mm` and beyond, the second."""
 
     words: str
-    low: float
-    high: float
+    most_mm: float
+    colours: tuple[Colour, Colour]
 
 
 def spans(polygon: FloatArray, top: int, bottom: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -195,7 +195,7 @@ class Markings:
         if np.isfinite(moment.residual_mm):
             words.append(f"residual {moment.residual_mm:.2f} mm")
         ok = moment.status == PoseStatus.OK
-        texts = [(self._scene.title, look.text), ("   ".join(words), look.faint_text if ok else look.warning)]
+        texts = [(self._scene.title, look.text), (" | ".join(words), look.faint_text if ok else look.warning)]
         if missing:
             texts.append((f"missing: {', '.join(missing)}", look.warning))
         texts += [(line, look.faint_text) for line in view.lines]
@@ -210,18 +210,15 @@ class Markings:
         look, typeface, marks, area = self._look, self._typeface, self._marks, self._layout.solid
         margin, steps = self._layout.margin, 24
         bottom = area.y + area.height - margin
-        low, high = f"{legend.low:.0f}", f"{legend.high:.1f} mm {legend.words}"
+        low, high = "0", f"{legend.most_mm:.0f} mm {legend.words}"
         marks.text(margin, bottom - typeface.line_px, low, look.text)
         left = margin + typeface.width(low) + 5
         right = left + min(0.25 * area.width, area.width - left - typeface.width(high) - margin)
-        for step in range(steps):
-            share = step / (steps - 1)
-            colour = tuple(
-                (1 - share) * near + share * far for near, far in zip(look.near, look.far, strict=True)
-            )
-            x = left + (right - left) * np.array([step, step + 1]) / steps
-            top = bottom - typeface.line_px
-            marks.bar(x[0], top + 2, x[1], top + typeface.size_px, (colour[0], colour[1], colour[2]))
+        shares = np.linspace(0.0, 1.0, steps)[:, None]
+        colours = (1 - shares) * legend.colours[0] + shares * legend.colours[1]
+        edges = left + (right - left) * np.arange(steps + 1) / steps
+        tops = np.full(steps, bottom - typeface.line_px)
+        marks.bars(edges[:-1], tops + 2, edges[1:], tops + typeface.size_px, colours)
         marks.text(right + 5, bottom - typeface.line_px, high, look.text)
 
     def _directions(self, flat: Projection) -> None:
