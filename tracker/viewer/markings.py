@@ -176,7 +176,7 @@ class Markings:
                 if left < other_right and other_left < left + width and top < bottom:
                     top = bottom
             taken.append((left, left + width, top + typeface.line_px))
-            self._backed(left, top, name, self._colour(coil, moment))
+            self._backed(left, top, name, self._look.warning if state else self._look.text)
 
     def _backed(self, x: float, y: float, text: str, colour: Colour) -> None:
         """Text on a ground of its own, readable on the tongue as well."""

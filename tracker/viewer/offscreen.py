@@ -32,20 +32,24 @@ class Offscreen:
     def __init__(self, scene: Scene, size: tuple[int, int], look: Look, samples: int = 0) -> None:
         self.size = size
         self._context = egl_context()
-        self._smooth = self._target(min(samples, self._context.max_samples)) if samples else None
-        self._plain = self._target(0)
-        self.renderer = Renderer(self._context, scene, size, look)
+        with (
+            self._context
+        ):  # other contexts of this process may come and go: each call makes its own the current one
+            self._smooth = self._target(min(samples, self._context.max_samples)) if samples else None
+            self._plain = self._target(0)
+            self.renderer = Renderer(self._context, scene, size, look)
 
     def picture(self, moment: Moment, view: View) -> NDArray[np.uint8]:
         """(height, width, 3) red, green and blue, the upper row first."""
-        if self._smooth is None:
-            self.renderer.draw(moment, view, self._plain)
-        else:
-            self.renderer.draw(moment, view, self._smooth)
-            self._context.copy_framebuffer(self._plain, self._smooth)
+        with self._context:
+            if self._smooth is None:
+                self.renderer.draw(moment, view, self._plain)
+            else:
+                self.renderer.draw(moment, view, self._smooth)
+                self._context.copy_framebuffer(self._plain, self._smooth)
+            data = self._plain.read(components=3, alignment=1)
         width, height = self.size
-        pixels = np.frombuffer(self._plain.read(components=3, alignment=1), dtype=np.uint8)
-        return np.ascontiguousarray(pixels.reshape(height, width, 3)[::-1])
+        return np.ascontiguousarray(np.frombuffer(data, dtype=np.uint8).reshape(height, width, 3)[::-1])
 
     def _target(self, samples: int) -> moderngl.Framebuffer:
         context, size = self._context, self.size
@@ -55,11 +59,13 @@ class Offscreen:
         )
 
     def close(self) -> None:
-        self.renderer.release()
-        for target in (self._plain, self._smooth):
-            if target is not None:
-                for part in (*target.color_attachments, target.depth_attachment, target):
-                    part.release()
+        """Gives everything back."""
+        with self._context:
+            self.renderer.release()
+            for target in (self._plain, self._smooth):
+                if target is not None:
+                    for part in (*target.color_attachments, target.depth_attachment, target):
+                        part.release()
         self._context.release()
 
     def __enter__(self) -> Self:
