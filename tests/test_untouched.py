@@ -30,7 +30,7 @@ from tonguetrack.tracker.streams.slot import SlotSink
 from tonguetrack.tracker.streams.targets import open_target, parse_target
 
 RATE_HZ = 250.0
-FRAMES = 300
+FRAMES = 200
 WORST_RATIO = {50: 20.0, 90: 100.0}
 """Percentile -> how many times its value alone it may be in bad company."""
 PATIENCE_S = 30.0
