@@ -14,7 +14,7 @@ from tonguetrack import InputError
 from tonguetrack.model.multilinear import SurfaceMarks
 from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.cli import main
-from tonguetrack.tracker.session import load_session, parse_session, session_toml
+from tonguetrack.tracker.session import load_session, parse_session, session_toml, with_shape_ranges
 from tonguetrack.tracker.streams.shapes import (
     AXES,
     LEAST,
@@ -481,6 +481,28 @@ def test_ranges_in_a_session_are_read_back_the_same():
 def test_a_wrong_range_in_a_session_is_named(line, sentence):
     with pytest.raises(InputError, match=sentence):
         parse_session(f"[shapes]\n{line}\n", "s.toml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        '[coils]\nT1 = "tongue_tip"',
+        "shapes.tip_up = [1, 2]\n[energy]\nalpha = 2.0 # kept\n",
+        "shapes = { tip_up = [1, 2] }\n",
+        "[shapes]\ntip_down = [0, 1]\n[energy]\nalpha = 2.0 # kept\n",
+        "[energy]\r\nalpha = 2.0 # kept\r\n",
+    ],
+)
+def test_however_a_session_is_written_its_ranges_are_replaced_and_the_rest_is_kept(text):
+    ranges = {"tip_up": (0.5, 2.0), "pose_0": (-0.123456789, 1e-7)}
+    written = with_shape_ranges(text, ranges)
+    again = parse_session(written, "s.toml")
+    assert again.shape_ranges == ranges
+    assert again.energy == parse_session(text, "s.toml").energy
+    assert again.coils == parse_session(text, "s.toml").coils
+    assert ("# kept" in text) == ("# kept" in written)
+    assert with_shape_ranges(written, ranges) == written
 
 
 ROOT = Path(__file__).parents[1]

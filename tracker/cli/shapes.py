@@ -90,5 +90,5 @@ def _save(path: Path, ranges: dict[str, tuple[float, float]]) -> None:
     from ...atomic import write_atomically
     from ..session import with_shape_ranges
 
-    write_atomically(path, with_shape_ranges(path.read_text(encoding="utf-8"), ranges).encode())
+    write_atomically(path, with_shape_ranges(path.read_bytes().decode(), ranges).encode())
     print(f"written: [shapes] of {path}", file=sys.stderr)
