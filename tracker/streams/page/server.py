@@ -7,22 +7,14 @@ prints one line, `page http://...`, when it listens, and ends with the run that 
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 from .... import InputError
 
-DEFAULT_ADDRESS = "127.0.0.1:8080"
-POLITENESS = 5
-"""Added to the process's niceness: where processors are short, tracking comes first."""
 
-
-def serve(
-    folder: Path, address: str = DEFAULT_ADDRESS, said: Callable[[str], None] = lambda line: None
-) -> None:
+def serve(folder: Path, address: str, said: Callable[[str], None]) -> None:
     """Serves the feed in `folder` at HOST:PORT until its run is over, or SIGTERM or SIGINT asks for an end.
 
     Port 0 is any free one. said: called with the line `page http://...` once it listens. Raises InputError where
@@ -49,13 +41,10 @@ def main() -> None:
     if len(sys.argv) != 3:
         print("usage: FOLDER HOST:PORT", file=sys.stderr)
         raise SystemExit(2)
-    if hasattr(os, "nice"):
-        with suppress(OSError):
-            os.nice(POLITENESS)
     try:
         serve(Path(sys.argv[1]), sys.argv[2], lambda line: print(line, flush=True))
     except InputError as reason:
-        print(reason, file=sys.stderr)
+        print(f"tonguetrack: {reason}", file=sys.stderr)
         raise SystemExit(2) from reason
 
 

@@ -51,7 +51,8 @@ MAX_WAITING = 32
 """Connections that are no WebSocket yet; a further one pushes out the oldest."""
 STALL_S = 10.0
 """A page that says nothing, or takes nothing, for so long is closed."""
-WISHES_A_SECOND = 60
+MESSAGES_A_SECOND = 240
+"""From a page that acknowledges every pose, and some more; beyond, it is closed."""
 SETTLED_S = 0.5
 """A speaker that has stayed the same for so long gets a `model.glb`."""
 OVERLAP_S = 1.0
@@ -316,7 +317,7 @@ class PageServer:
         async for message in page.connection:
             now_s = time.monotonic()
             second, heard = (second, heard + 1) if int(now_s) == second else (int(now_s), 1)
-            if heard > WISHES_A_SECOND or not isinstance(message, str):
+            if heard > MESSAGES_A_SECOND or not isinstance(message, str):
                 await page.connection.close(1008)
                 return
             try:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import re
 import secrets
 import socket
 from dataclasses import dataclass
-from urllib.parse import urlsplit
 
 from ..osc import parse_destination, resolve
 
 TOKEN_BYTES = 18
+_HOST_HEADER = re.compile(r"(?:\[(?P<v6>[0-9a-fA-F:.]+)\]|(?P<name>[\w.-]+))(?::\d+)?")
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Door:
 
     def resource(self, path: str) -> str | None:
         """The resource that a request's path names, without token and query; None for one without the token."""
-        path = urlsplit(path).path if path.startswith("/") else ""
+        path = path.partition("?")[0]
         given = path[: len(self.prefix)]
         if not hmac.compare_digest(given.encode("utf-8", "replace"), self.prefix.encode()):
             return None
@@ -53,8 +54,9 @@ class Door:
         """
         if self.token:
             return True
-        name = urlsplit(f"//{host_header}").hostname or ""
-        return name in ("localhost", self.host) or is_loopback(name)
+        named = _HOST_HEADER.fullmatch(host_header)
+        name = (named["v6"] or named["name"]).lower() if named else ""
+        return name in ("localhost", self.host.lower()) or is_loopback(name)
 
 
 def door_at(address: str) -> Door:
