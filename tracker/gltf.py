@@ -25,9 +25,6 @@ from ..model.multilinear import SpeakerModel
 from ..model.rebasing import Rebased
 
 COIL_RADIUS_MM = 1.5
-TISSUE = {"name": "tissue", "color": [0.72, 0.28, 0.27, 1.0], "rough": 0.45}
-BONE = {"name": "palate", "color": [0.85, 0.8, 0.65, 1.0], "rough": 0.9}
-METAL = {"name": "coil", "color": [0.95, 0.75, 0.2, 1.0], "rough": 0.35}
 _MAGIC, _VERSION, _JSON, _BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _FLOAT, _UINT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963  # what a buffer view is for
@@ -48,12 +45,14 @@ def glb(
     clip: Clip | None = None,
     palate: FloatArray | None = None,
     coils: Coils | None = None,
+    directions: Sequence[str] = (),
 ) -> bytes:
     """The content of a .glb file.
 
     rebased: the raw weights that become 0 and 1. clip: what the tongue does, as an animation from 0 s on; without one
     the tongue rests at the speaker's mean weights. palate: (p, 3) mm, a line. coils: balls that move with the clip and
-    vanish where a coil is missing; one that is never there is left out.
+    vanish where a coil is missing; one that is never there is left out. directions: the K names of the targets, else
+    pose_0, pose_1, ...
     Raises InputError for a clip whose times do not increase, and for a model without faces.
     """
     if not len(speaker.faces):
@@ -62,7 +61,9 @@ def glb(
         raise InputError("coils need a clip with the same frames.")
     file = _File()
     unit = rebased.to_unit(speaker.mean if clip is None else clip[1])
-    file.nodes.append({"name": name, "mesh": _tongue(file, speaker, rebased, name, np.atleast_2d(unit)[0])})
+    names = directions or [f"pose_{k}" for k in range(len(speaker.directions))]
+    tongue = _tongue(file, speaker, rebased, name, names, np.atleast_2d(unit)[0])
+    file.nodes.append({"name": name, "mesh": tongue})
     if palate is not None:
         file.nodes.append({"name": "palate", "mesh": _line(file, palate)})
     if clip is not None:
@@ -76,6 +77,20 @@ def glb(
 def to_scene(points: FloatArray) -> FloatArray:
     """Positions or directions (..., 3) in mm of the model frame, in metres of glTF's axes."""
     return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1).astype(np.float64) / 1000.0
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """color: red, green, blue, opacity, linear, 0..1; roughness: 0 a mirror, 1 chalk."""
+
+    name: str
+    color: tuple[float, float, float, float]
+    roughness: float
+
+
+_TISSUE = _Surface("tissue", (0.72, 0.28, 0.27, 1.0), 0.45)
+_BONE = _Surface("palate", (0.85, 0.8, 0.65, 1.0), 0.9)
+_METAL = _Surface("coil", (0.95, 0.75, 0.2, 1.0), 0.35)
 
 
 @dataclass
@@ -110,9 +125,13 @@ class _File:
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
-    def material(self, name: str, color: list[float], rough: float) -> int:
-        surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": rough}
-        self.materials.append({"name": name, "pbrMetallicRoughness": surface, "doubleSided": True})
+    def material(self, surface: _Surface) -> int:
+        shine = {
+            "baseColorFactor": list(surface.color),
+            "metallicFactor": 0.0,
+            "roughnessFactor": surface.roughness,
+        }
+        self.materials.append({"name": surface.name, "pbrMetallicRoughness": shine, "doubleSided": True})
         return len(self.materials) - 1
 
     def mesh(self, name: str, primitive: dict[str, Any], **more: Any) -> int:
@@ -148,19 +167,25 @@ class _File:
         return head + text + struct.pack("<II", len(self.buffer), _BIN) + bytes(self.buffer)
 
 
-def _tongue(file: _File, speaker: SpeakerModel, rebased: Rebased, name: str, rest: FloatArray) -> int:
+def _tongue(
+    file: _File,
+    speaker: SpeakerModel,
+    rebased: Rebased,
+    name: str,
+    directions: Sequence[str],
+    rest: FloatArray,
+) -> int:
     """rest: (K,) re-based weights of the tongue where no animation is played."""
     base = to_scene(rebased.base(speaker).reshape(-1, 3))
     targets = to_scene(rebased.directions(speaker).reshape(len(speaker.directions), -1, 3))
     normal, turns = _linear_normals(base, targets, speaker.faces)
-    names = [f"pose_{k + 1}" for k in range(len(targets))]
     primitive = {
         "attributes": {
             "POSITION": file.accessor(base, _VERTICES, bounds=True),
             "NORMAL": file.accessor(normal, _VERTICES),
         },
         "indices": file.accessor(speaker.faces.reshape(-1, 1), _INDICES),
-        "material": file.material(**TISSUE),
+        "material": file.material(_TISSUE),
         "targets": [
             {
                 "POSITION": file.accessor(target, _VERTICES, bounds=True),
@@ -170,7 +195,7 @@ def _tongue(file: _File, speaker: SpeakerModel, rebased: Rebased, name: str, res
         ],
     }
     extras = {
-        "targetNames": names,
+        "targetNames": list(directions),
         "weights_low": rebased.low.tolist(),
         "weights_high": rebased.high.tolist(),
     }
@@ -209,7 +234,7 @@ def _line(file: _File, points: FloatArray) -> int:
     primitive = {
         "attributes": {"POSITION": place},
         "mode": _LINE_STRIP,
-        "material": file.material(**BONE),
+        "material": file.material(_BONE),
     }
     return file.mesh("palate", primitive)
 
@@ -229,7 +254,7 @@ def _seconds(file: _File, times_s: FloatArray) -> int:
 def _animate_coils(file: _File, coils: Coils, times_s: FloatArray, times: int) -> None:
     """times: the accessor of all frames' times."""
     names, positions = coils
-    there = np.isfinite(positions).all(axis=2)  # (frames, n)
+    there = np.asarray(np.isfinite(positions).all(axis=2))  # (frames, n)
     ball = _ball(file) if there.any() else None
     since = times_s - times_s[0]
     for index, name in enumerate(names):
@@ -273,6 +298,6 @@ def _ball(file: _File) -> int:
             "NORMAL": file.accessor(points, _VERTICES),
         },
         "indices": file.accessor(faces.reshape(-1, 1), _INDICES),
-        "material": file.material(**METAL),
+        "material": file.material(_METAL),
     }
     return file.mesh("coil", primitive)

@@ -23,6 +23,7 @@ def build_parser() -> argparse.ArgumentParser:
         doctor,
         evaluate,
         experiment,
+        export,
         files,
         live,
         model,
@@ -40,8 +41,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"tonguetrack {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for family in (
-        demo, live, track, calibrate, anatomy, files, take, devices, doctor, model, evaluate, experiment, simulate,
-        monitor, shapes, bench,
+        demo, live, track, export, calibrate, anatomy, files, take, devices, doctor, model, evaluate, experiment,
+        simulate, monitor, shapes, bench,
     ):  # fmt: skip
         family.add_commands(commands)
     return parser

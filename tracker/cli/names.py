@@ -13,6 +13,7 @@ from ... import InputError
 if TYPE_CHECKING:
     from ...model.multilinear import TongueModel
     from ..pose import TrackedPoses
+    from ..transfer import OtherSpeaker
 
 BUNDLED = "bundled"
 
@@ -49,6 +50,28 @@ def _model_of(poses: TrackedPoses, path: str) -> TongueModel:
     if poses.model_path != BUNDLED and not Path(poses.model_path).is_file():
         raise InputError(f"{path}: its model {poses.model_path} is not there any more; name it with --model.")
     return named_model(poses.model_path)
+
+
+def add_speaker_flag(parser: argparse.ArgumentParser) -> None:
+    """For every command that makes a mesh of tracked poses; see `replayed`."""
+    parser.add_argument(
+        "--speaker",
+        metavar="FILE|WEIGHTS",
+        help="the same motion on another speaker's anatomy: a session file (.toml) with [speaker] weights, or the raw "
+        "weights themselves, --speaker=0.1,-0.2,...",
+    )
+
+
+def replayed(
+    poses: TrackedPoses, model: TongueModel, speaker: str | None
+) -> tuple[TrackedPoses, OtherSpeaker | None]:
+    """The poses as --speaker wants them, and that speaker; without it the poses themselves, and None."""
+    if speaker is None:
+        return poses, None
+    from ..transfer import other_speaker, transferred
+
+    other = other_speaker(speaker, model)
+    return transferred(poses, other), other
 
 
 def as_text(name: str) -> str:

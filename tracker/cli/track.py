@@ -16,11 +16,13 @@ from ... import InputError
 from .names import (
     BUNDLED,
     add_recording_flags,
+    add_speaker_flag,
     keep_apart,
     named_model,
     parsed_coils,
     poses_and_model,
     prepare_folder,
+    replayed,
 )
 
 if TYPE_CHECKING:
@@ -66,6 +68,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--every", type=int, metavar="K", help="every K-th frame, numbered: tongue_000000.ply, ..."
     )
     mesh.add_argument("-o", "--output", required=True, metavar="FILE", help="tongue.ply or tongue.obj")
+    add_speaker_flag(mesh)
     mesh.add_argument("--model", help="the model, where it is not where the poses say")
     mesh.set_defaults(run=run_mesh)
 
@@ -338,7 +341,8 @@ def _with_progress(jobs: list[Job]) -> Any:
 
 def run_mesh(args: argparse.Namespace) -> int:
     from ...atomic import write_atomically
-    from ...model.mesh import MESH_SUFFIXES, Mesh, mesh_bytes
+    from ...model.mesh import MESH_SUFFIXES, mesh_bytes
+    from ..exporting import frame_mesh, write_mesh_sequence
 
     target = Path(args.output)
     if target.suffix.lower() not in MESH_SUFFIXES:
@@ -346,21 +350,21 @@ def run_mesh(args: argparse.Namespace) -> int:
             f"{target}: meshes are written as {' or '.join(MESH_SUFFIXES)}; end the name in one of them."
         )
     poses, model = poses_and_model(args.poses, args.model)
+    poses, _ = replayed(poses, model, args.speaker)
     if args.frame is not None:
         if not 0 <= args.frame < poses.frame_count:
             raise InputError(
                 f"--frame {args.frame}: {args.poses} has the frames 0 to {poses.frame_count - 1}."
             )
-        frames = [args.frame]
+        prepare_folder(target)
+        write_atomically(target, mesh_bytes(frame_mesh(model, poses, args.frame), target.suffix))
+        written = str(target)
     else:
         if args.every < 1:
             raise InputError(f"--every {args.every}: expected 1 or more.")
-        frames = list(range(0, poses.frame_count, args.every))
-    prepare_folder(target)
-    for frame in frames:
-        mesh = Mesh(model.vertices(poses.speaker_weights[frame], poses.weights[frame]), model.faces)
-        numbered = target.with_name(f"{target.stem}_{frame:06d}{target.suffix}")
-        write_atomically(target if args.frame is not None else numbered, mesh_bytes(mesh, target.suffix))
-    written = str(target) if args.frame is not None else f"{len(frames)} meshes beside {target}"
+        frames = range(0, poses.frame_count, args.every)
+        prepare_folder(target)
+        write_mesh_sequence(model, poses, frames, target)
+        written = f"{len(frames)} meshes beside {target}"
     print(f"written: {written} ({model.name}, {model.vertex_count} vertices, mm)", file=sys.stderr)
     return 0
