@@ -12,14 +12,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from tonguetrack.tracker.bundled import bundled_model
-from tonguetrack.tracker.streams.shapes import (
-    SHAPES,
-    STATIONS,
-    ShapeMeter,
-    contour_with_parts,
-    landmark_vertices,
-    speaker_ranges,
-)
+from tonguetrack.tracker.streams.landmarks import STATIONS, contour_with_parts, landmark_vertices
+from tonguetrack.tracker.streams.shapes import SHAPES, ShapeMeter, speaker_ranges
 
 TARGET = Path(__file__).parent / "shapes.png"
 BLUE, GREY = "#1f5fa8", "#9a9a9a"

@@ -6,7 +6,7 @@ import pytest
 from tonguetrack.model.synthetic import Anatomy
 from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.streams.contact import REGIONS, ContactMeter, gaps_below, segments_of
-from tonguetrack.tracker.streams.shapes import contour_with_parts
+from tonguetrack.tracker.streams.landmarks import contour_with_parts
 
 MODEL = bundled_model()
 MEAN = MODEL.speaker.mean, MODEL.pose.mean

@@ -15,15 +15,14 @@ from tonguetrack.model.multilinear import SurfaceMarks
 from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.cli import main
 from tonguetrack.tracker.session import load_session, parse_session, session_toml, with_shape_ranges
+from tonguetrack.tracker.streams.landmarks import STATIONS, landmark_vertices
 from tonguetrack.tracker.streams.shapes import (
     AXES,
     LEAST,
     SHAPES,
-    STATIONS,
     ShapeMeter,
     axes_of,
     default_ranges,
-    landmark_vertices,
     shape_names,
     speaker_ranges,
 )

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...model.multilinear import TongueModel
 from ..pose import FloatArray
-from .shapes import contour_with_parts
+from .landmarks import contour_with_parts
 
 REGIONS = {"tip": 0.06, "blade": 0.18, "front": 0.33, "body": 0.48, "back": 0.65}
 """Region of the contour -> the part of its length, from the tip, where it ends. Behind the last, the tongue faces the
