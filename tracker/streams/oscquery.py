@@ -59,7 +59,7 @@ NOT_KEPT, READ_ONLY, WRITE_ONLY = 0, 1, 2
 MOST_CLIENTS = 8
 CLIENT_S = 5.0
 """A client that is silent for longer is left."""
-REST_S = 0.01
+REST_S = 0.02
 """Between two requests: however many come, the tracker beside them keeps its computer."""
 LONGEST_REQUEST_S = 10.0
 GLB_PERIOD_S = 1.0
@@ -196,9 +196,10 @@ def _node(path: str, description: str, arguments: list[Argument], access: int) -
 class OscQueryWorker:
     """Serves the tree from threads of its own; a worker, so that it always has the newest pose.
 
-    address: HOST:PORT to listen at, port 0 = any; `address` then says which. numbers: what the run says of itself. said: is called when it cannot be announced.
-    Raises InputError where it cannot listen there. Only GET and HEAD; a few clients at a time, a hundred answers a second
-    at most. Bound to this computer, it answers no page of a foreign site: their Host is another name.
+    address: HOST:PORT to listen at, port 0 = any; `address` then says which. numbers: what the run says of itself.
+    said: is called when it cannot be announced. Raises InputError where it cannot listen there.
+    Only GET and HEAD; a few clients at a time, fifty answers a second at most. Bound to this computer, it answers no
+    page of a foreign site: their Host is another name.
     """
 
     def __init__(
@@ -222,12 +223,13 @@ class OscQueryWorker:
         self._space: AddressSpace | None = None
         self._info: StreamInfo | None = None
         self._newest: tuple[int, TrackedPose] | None = None
+        self._tree: tuple[tuple[int, TrackedPose] | None, Node] | None = None
         self._glb: tuple[float, FloatArray, bytes] | None = None
 
     def begin(self, info: StreamInfo) -> None:
         space = AddressSpace(self._context, info)
         with self._asking:
-            self._space, self._info = space, info
+            self._space, self._info, self._tree = space, info, None
         if self._thread is None:
             self._thread = threading.Thread(target=self._server.serve, name="OSCQuery", daemon=True)
             self._thread.start()
@@ -252,19 +254,29 @@ class OscQueryWorker:
         if query == "HOST_INFO":
             return _json(self._host_info(own_host))
         if path == MODEL_PATH:
-            return HTTPStatus.OK, "model/gltf-binary", self._model()
+            try:
+                return HTTPStatus.OK, "model/gltf-binary", self._model()
+            except InputError as reason:  # a model without faces
+                return HTTPStatus.NOT_FOUND, "text/plain", str(reason).encode()
         if query and query not in ATTRIBUTES:
             return HTTPStatus.BAD_REQUEST, "text/plain", f"there is no attribute '{query[:40]}'".encode()
         with self._asking:
-            assert self._space is not None, "begin() comes before any answer"
-            number, pose = self._newest or (0, None)
-            numbers = self._numbers() if self._numbers is not None else None
-            node = find_node(self._space.tree(pose, number, numbers), path)
+            node = find_node(self._newest_tree(), path)
             if node is None:
                 return HTTPStatus.NOT_FOUND, "text/plain", b"there is no such address"
             if query and query not in node:
                 return HTTPStatus.NO_CONTENT, "", b""
             return _json({query: node[query]} if query else node)
+
+    def _newest_tree(self) -> Node:
+        """Made once for every pose: however many ask, that is as often as poses come."""
+        newest = self._newest
+        if self._tree is None or self._tree[0] is not newest:
+            assert self._space is not None, "begin() comes before any answer"
+            number, pose = newest or (0, None)
+            numbers = self._numbers() if self._numbers is not None else None
+            self._tree = newest, self._space.tree(pose, number, numbers)
+        return self._tree[1]
 
     def _host_info(self, own_host: str) -> Node:
         about: Node = {
@@ -401,7 +413,7 @@ class _Handler(BaseHTTPRequestHandler):
 def _is_local_name(host: str) -> bool:
     """Whether a Host header names this computer, and not a site of the internet whose name leads here."""
     name = host.rpartition(":")[0] if host.rpartition(":")[2].isdigit() else host
-    name = name.strip("[]").lower()
+    name = name.strip("[]").rstrip(".").lower()
     if name == "localhost" or name.endswith(".local"):
         return True
     try:
