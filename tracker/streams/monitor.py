@@ -359,8 +359,10 @@ def _printable(text: str) -> str:
 def _plain(value: object) -> object:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
     return value if isinstance(value, int) else _printable(str(value))
 
 
 def _short(value: object) -> str:
-    return f"{value:.3f}" if isinstance(value, float) else _printable(str(value))
+    return f"{value:.3f}" if isinstance(value, float) else _printable(str(_plain(value)))

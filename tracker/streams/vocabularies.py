@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any
 
 MAX_NAMES = 512
@@ -69,7 +70,7 @@ class NamedValues:
             "missing": self.missing,
             "unknown": self.unknown,
             "counts": dict(sorted(self.counts.items())),
-            "last": dict(sorted(self.last.items())),
+            "last": {name: value if isfinite(value) else None for name, value in sorted(self.last.items())},
             "beyond": self.beyond,
         }
 
