@@ -143,6 +143,22 @@ def test_every_module_that_the_page_imports_is_served(server):
             assert get(server, f"/{imported}")[0] == 200
 
 
+def test_the_bundle_exports_what_the_page_imports():
+    """three.bundle.js is three.entry.js with everything in it: one names what the other holds."""
+    entry = (PAGE / "three.entry.js").read_text()
+    exported = set(re.findall(r"\w+", " ".join(re.findall(r"export \{(.*?)\}", entry, re.DOTALL))))
+    bundled = re.findall(r"export\{([^}]*)\};?\s*$", (PAGE / "three.bundle.js").read_text())[0]
+    assert {part.split(" as ")[-1] for part in bundled.split(",")} == exported
+    imported = set()
+    for name in OWN_FILES[2:]:
+        for names in re.findall(
+            r"import \{([^}]*)\} from \"\./three\.bundle\.js\"", (PAGE / name).read_text()
+        ):
+            imported |= set(re.findall(r"\w+", names))
+    assert imported == exported
+    assert "MIT License" in (PAGE / "three.license.txt").read_text()
+
+
 def test_nothing_that_we_wrote_asks_for_anything_from_elsewhere():
     for name in OWN_FILES:
         assert not re.search(r"(?<!xmlns=.)https?://|//cdn|@import", (PAGE / name).read_text()), name

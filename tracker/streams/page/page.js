@@ -63,7 +63,7 @@ function begin(message) {
     $("title").textContent = hello.title;
     $("model").textContent = `model: ${hello.model.name}`;
     for (const control of $("controls").querySelectorAll("input, button")) control.disabled = !hello.control;
-    answer(hello.control ? "" : "this run takes no wishes");
+    answer(hello.control ? "" : "This run is not controlled from here; a live one is.");
   }
   if (other || hello.model.number !== wanted) fetchModel(hello.model.number);
 }

@@ -143,6 +143,19 @@ class Page:
         self._sending_since_s = None
 
 
+class _Counted(ServerConnection):
+    waiting: Waiting
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        assert isinstance(transport, asyncio.Transport)
+        self.waiting.add(self, transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self.waiting.remove(self)
+
+
 class Waiting:
     """The connections that are no WebSocket yet. At most `MAX_WAITING`: whoever dawdles makes way for others."""
 
@@ -165,19 +178,9 @@ class Waiting:
 
     def connection(self, *arguments: Any, **options: Any) -> ServerConnection:
         """A connection that is counted from its first to its last moment."""
-        waiting = self
-
-        class Counted(ServerConnection):
-            def connection_made(self, transport: asyncio.BaseTransport) -> None:
-                super().connection_made(transport)
-                assert isinstance(transport, asyncio.Transport)
-                waiting.add(self, transport)
-
-            def connection_lost(self, exc: Exception | None) -> None:
-                super().connection_lost(exc)
-                waiting.remove(self)
-
-        return Counted(*arguments, **options)
+        made = _Counted(*arguments, **options)
+        made.waiting = self
+        return made
 
 
 class PageServer:
@@ -368,7 +371,7 @@ class PageServer:
         if not self._anatomy.fits(pose.speaker_weights):
             if self._making is None and now_s - self._speaker_since_s > SETTLED_S:
                 self._making = asyncio.create_task(self._follow(pose.speaker_weights))
-        elif now_s > self._overlap_until_s:
+        elif self._making is None and now_s > self._overlap_until_s:
             return None
         return self._anatomy.vertices(pose.speaker_weights, pose.weights)
 
@@ -436,7 +439,7 @@ def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
         "Content-Length": str(len(body)),
         "Connection": "close",
         "Cache-Control": "no-store",
-        "Content-Security-Policy": "default-src 'self'; connect-src 'self' ws: wss:; img-src 'self' data:; "
+        "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
         "Cross-Origin-Resource-Policy": "same-origin",
         "Referrer-Policy": "no-referrer",
