@@ -234,7 +234,7 @@ def test_the_cut_is_filled_below_the_contour_and_not_above(drawing, model, scene
     below, above = flat_place(drawing, np.array([middle - [0, 0, 6], middle + [0, 0, 6]])).astype(int)
     inside = picture[below[1], below[0]].astype(int)
     assert inside[0] > 1.5 * inside[2]
-    assert not unlike(picture, DARK.panel)[above[1], above[0]]
+    assert not unlike(picture, DARK.background)[above[1], above[0]]
 
 
 def test_the_flat_view_has_a_bar_of_ten_millimetres(drawing, model, scene):
@@ -275,8 +275,8 @@ def test_a_missing_coil_is_not_drawn_but_named(drawing, model, scene):
     x, y = flat_place(drawing, coils)[1].astype(int)
     coils[1] = np.nan
     one_less = drawing.picture(posed(model, POSES[0], coils), view)
-    assert unlike(all_there, DARK.panel)[y, x]
-    assert not unlike(one_less, DARK.panel)[y, x]
+    assert unlike(all_there, DARK.background)[y, x]
+    assert not unlike(one_less, DARK.background)[y, x]
     layout = drawing.renderer.layout
     third_line = slice(layout.margin + 2 * layout.font_px, layout.margin + 4 * layout.font_px)
     warned = ~unlike(one_less[third_line, : layout.solid.width], DARK.warning, 40)
@@ -400,13 +400,15 @@ def letters(drawing, moment, view):
     """Rows of all letters of a picture."""
     rows = []
     draw = drawing.renderer._drawer.draw
-    drawing.renderer._drawer.draw = lambda marks, *rest: (rows.append(marks), draw(marks, *rest))
+    drawing.renderer._drawer.draw = lambda marks, *rest: (
+        rows.append(marks.kinds[LETTER]),
+        draw(marks, *rest),
+    )
     try:
         drawing.picture(moment, view)
     finally:
         drawing.renderer._drawer.draw = draw
-    marks = np.concatenate(rows)
-    return marks[marks[:, 0] == LETTER]
+    return np.concatenate(rows)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -431,7 +433,7 @@ def test_no_letter_is_cut_by_the_pictures_edge_or_runs_into_another_area(model, 
         rows = letters(drawing, moment, view)
         layout = drawing.renderer.layout
         font = layout.font_px
-    left, top, right = rows[:, 1], rows[:, 2], rows[:, 3] - 2
+    left, top, right = rows[:, 0], rows[:, 1], rows[:, 2] - 2
     assert len(rows) > 200
     assert left.min() >= 0 and right.max() <= size[0]
     assert top.min() >= 0 and (top + 1.25 * font).max() <= size[1]
@@ -442,7 +444,7 @@ def test_no_letter_is_cut_by_the_pictures_edge_or_runs_into_another_area(model, 
 def test_more_lines_than_there_is_room_for_are_counted(drawing, model, scene):
     view = dataclasses.replace(home_view(scene), lines=tuple(f"line {number}" for number in range(100)))
     rows = letters(drawing, posed(model, POSES[0]), view)
-    assert rows[:, 2].max() + drawing.renderer.layout.font_px <= SIZE[1]
+    assert rows[:, 1].max() + drawing.renderer.layout.font_px <= SIZE[1]
     few = letters(drawing, posed(model, POSES[0]), dataclasses.replace(view, lines=("line 1",)))
     assert len(few) < len(rows) < len(few) + 100 * 6
 
@@ -454,9 +456,9 @@ def test_names_of_coils_at_one_place_stand_below_each_other(drawing, model, scen
     named = letters(drawing, posed(model, POSES[0], together), view)
     flat = drawing.renderer.layout.flat
     in_flat = [
-        rows[(rows[:, 1] >= flat.x) & (rows[:, 2] < flat.y + 0.7 * flat.height)] for rows in (plain, named)
+        rows[(rows[:, 0] >= flat.x) & (rows[:, 1] < flat.y + 0.7 * flat.height)] for rows in (plain, named)
     ]
-    heights = np.unique(in_flat[1][:, 2])
+    heights = np.unique(in_flat[1][:, 1])
     assert len(in_flat[0]) == 0 and len(heights) == 3
     assert np.diff(heights).min() >= drawing.renderer.layout.font_px
 
@@ -469,7 +471,7 @@ def test_bars_are_as_high_as_the_weights_in_sigma(model, scene, look):
         picture = drawing.picture(posed(model, (2.0, -1.0, 3.5, 0.0)), home_view(scene))
         area = drawing.renderer.layout.bars
     right_edge = picture[area.y : area.y + area.height, area.x + area.width - 9]
-    lines = np.flatnonzero(unlike(right_edge[None], look.panel, 20)[0])
+    lines = np.flatnonzero(unlike(right_edge[None], look.background, 20)[0])
     lines = lines[np.concatenate([[True], np.diff(lines) > 2])]
     per_sigma = (lines[2] - lines[0]) / 6
     panel = picture[area.y : area.y + area.height, area.x : area.x + area.width]

@@ -13,7 +13,7 @@ from tonguetrack.tracker.pose import CoilState, PoseStatus, TrackedPose, Tracked
 from tonguetrack.tracker.session import Session
 from tonguetrack.tracker.viewer.camera import Area, flat_projection, home_view, layout_of, solid_projection
 from tonguetrack.tracker.viewer.look import DARK, LIGHT
-from tonguetrack.tracker.viewer.markings import spans
+from tonguetrack.tracker.viewer.markings import slabs
 from tonguetrack.tracker.viewer.scene import (
     midsagittal_outline,
     moment_of,
@@ -285,22 +285,27 @@ def test_orbiting_goes_round_and_zooming_and_pitching_have_limits(scene):
     assert 0 < nearest < view.distance_mm < np.inf
 
 
-# The rows of the filled cut -------------------------------------------------------------------------
+# The filled cut -------------------------------------------------------------------------------------
 
 
-def test_the_rows_of_a_polygon_add_up_to_its_area():
-    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+def areas(upper, lower):
+    """Of trapezoids."""
+    return 0.5 * ((upper[:, 1] - upper[:, 0]) + (lower[:, 1] - lower[:, 0])) * (lower[:, 2] - upper[:, 2])
+
+
+def test_the_slabs_of_a_polygon_add_up_to_its_area_exactly():
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False) + 0.01
     star = (60 + 25 * np.cos(5 * angle))[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]) + 100
     x, y = star.T
     area = 0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
-    _, left, right = spans(star, 0, 200)
-    assert (right >= left).all()
-    assert (right - left).sum() == pytest.approx(area, rel=0.005)
+    upper, lower = slabs(star, 6.0)
+    assert (upper[:, 1] >= upper[:, 0] - 1e-9).all() and (lower[:, 1] >= lower[:, 0] - 1e-9).all()
+    assert (lower[:, 2] - upper[:, 2]).max() <= 6.0 + 1e-9
+    assert areas(upper, lower).sum() == pytest.approx(area, rel=1e-9)
 
 
-def test_a_hollow_is_left_out_and_what_is_outside_the_area_too():
+def test_a_hollow_is_left_out():
     u = np.array([[0, 0], [10, 0], [10, 20], [20, 20], [20, 0], [30, 0], [30, 30], [0, 30]], dtype=float)
-    rows, left, right = spans(u, 5, 25)
-    assert rows.min() == 5 and rows.max() == 24
-    assert [(a, b) for r, a, b in zip(rows, left, right, strict=True) if r == 10] == [(0, 10), (20, 30)]
-    assert [(a, b) for r, a, b in zip(rows, left, right, strict=True) if r == 22] == [(0, 30)]
+    upper, lower = slabs(u, 100.0)
+    assert upper.tolist() == [[0, 10, 0], [20, 30, 0], [0, 30, 20]]
+    assert lower.tolist() == [[0, 10, 20], [20, 30, 20], [0, 30, 30]]

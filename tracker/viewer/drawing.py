@@ -26,12 +26,14 @@ from .camera import (
 )
 from .look import Look
 from .markings import Legend, Markings, Section, Trails
-from .overlay import MarkDrawer, Typeface
+from .overlay import MarkDrawer, Taken, Typeface
 from .scene import Moment, Scene, palate_distance, vertex_uncertainty, weights_covariance
 from .shaders import (
     GHOST_FRAGMENT,
+    GHOST_VERTEX,
     TEXTURE_WIDTH,
     TONGUE_FRAGMENT,
+    TONGUE_VERTEX,
 )
 from .surface import Surface, SurfacePrograms, tongue_vertex_array
 
@@ -58,11 +60,15 @@ class Renderer:
         self._programs = SurfacePrograms(context, scene.model)
         followed = np.concatenate([scene.outline.vertices, np.asarray(scene.correspondences, dtype=np.intp)])
         self._tongue, self._ghost = (Surface(self._programs, followed) for _ in range(2))
-        self._tongue_program, self._tongue_array = tongue_vertex_array(self._programs, TONGUE_FRAGMENT)
-        self._ghost_program, self._ghost_array = tongue_vertex_array(self._programs, GHOST_FRAGMENT)
+        self._tongue_program, self._tongue_array = tongue_vertex_array(
+            self._programs, TONGUE_VERTEX, TONGUE_FRAGMENT
+        )
+        self._ghost_program, self._ghost_array = tongue_vertex_array(
+            self._programs, GHOST_VERTEX, GHOST_FRAGMENT
+        )
         self._values = context.texture((TEXTURE_WIDTH, self._programs.rows), 1, dtype="f4")
         self._values.filter = (context.NEAREST, context.NEAREST)
-        self._grain = context.texture((GRAIN_PX, GRAIN_PX), 4, grain().tobytes())
+        self._grain = context.texture((GRAIN_PX, GRAIN_PX), 2, grain().tobytes())
         self._drawer = MarkDrawer(context)
         self._past: deque[tuple[float, FloatArray]] = deque()
         self._coloured_by: object = None
@@ -112,7 +118,7 @@ class Renderer:
         context.enable(context.BLEND)
         context.blend_func = context.SRC_ALPHA, context.ONE_MINUS_SRC_ALPHA
         self._limit(framebuffer, self.layout.solid)
-        self._draw_marks(faint(in_space))
+        self._draw_marks(in_space.faint(HIDDEN))
         context.enable(context.DEPTH_TEST)
         self._draw_marks(in_space)
         context.disable(context.DEPTH_TEST)
@@ -130,14 +136,13 @@ class Renderer:
     def _draw_tongue(
         self, framebuffer: moderngl.Framebuffer, view: View, solid: Projection, by_value: bool
     ) -> None:
-        """The grounds, the tongue, and the ghost over it."""
+        """The ground, the tongue, and the ghost over it."""
         context, area = self._context, self.layout.solid
         framebuffer.use()
         framebuffer.depth_mask = True
-        self._limit(framebuffer, None)
-        framebuffer.clear(*self.look.panel, depth=1.0)
-        self._limit(framebuffer, area)
+        framebuffer.scissor = None
         framebuffer.clear(*self.look.background, depth=1.0)
+        self._limit(framebuffer, area)
         framebuffer.viewport = self._from_below(area)
         for program in (self._tongue_program, self._ghost_program):
             program["to_clip"].write(np.ascontiguousarray(solid.matrix.T, dtype="f4").tobytes())
@@ -161,9 +166,9 @@ class Renderer:
         tongue.normals.use(1)
         array.render()
 
-    def _draw_marks(self, rows: NDArray[np.float32]) -> None:
+    def _draw_marks(self, marks: Taken) -> None:
         assert self._typeface is not None
-        self._drawer.draw(rows, self.size, self._typeface.atlas)
+        self._drawer.draw(marks, self.size, self._typeface.atlas)
 
     def _limit(self, framebuffer: moderngl.Framebuffer, area: Area | None) -> None:
         """Nothing is drawn outside the area; None = the whole picture."""
@@ -244,15 +249,9 @@ def trusted_vertices(scene: Scene, moment: Moment) -> tuple[int, ...]:
     return tuple(v for v, place, state in coils if state == CoilState.TRUSTED and np.isfinite(place).all())
 
 
-def faint(rows: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Marks as they shine through the tongue."""
-    pale = rows.copy()
-    pale[:, 11] *= HIDDEN
-    return pale
-
-
 def grain() -> NDArray[np.uint8]:
-    """(n, n, 4) the surface's unevenness, repeating in both directions: two slopes, a tint, and nothing; 128 = even."""
+    """(n, n, 2) the surface's unevenness, repeating in both directions: its brightness, as bumps and blotches make it,
+    and how much of the gloss it throws back; 128 = as if it were even."""
     random = np.random.default_rng(1)
     frequency = np.hypot(*np.meshgrid(*[np.fft.fftfreq(GRAIN_PX) * GRAIN_PX] * 2))
 
@@ -261,7 +260,8 @@ def grain() -> NDArray[np.uint8]:
         heights = np.fft.ifft2(spectrum * np.exp(-(((frequency - around) / (0.5 * around)) ** 2))).real
         return np.asarray(heights / heights.std())
 
-    bumps, tint = noise(22.0), noise(5.0)
-    slopes = [bumps - np.roll(bumps, 1, axis=axis) for axis in (1, 0)]
-    parts = [slope / slope.std() for slope in slopes] + [0.6 * tint + 0.4 * bumps, np.zeros_like(tint)]
-    return np.clip(np.stack(parts, axis=-1) * 36 + 128, 0, 255).astype(np.uint8)
+    bumps, blotches = noise(22.0), noise(5.0)
+    slope = bumps - np.roll(bumps, (1, 1), axis=(0, 1))  # towards the light
+    brightness = 1.0 + 0.06 * slope / slope.std() + 0.05 * blotches
+    gloss = 1.0 + 0.35 * slope / slope.std()
+    return np.clip(128 * np.stack([brightness, gloss], axis=-1), 0, 255).astype(np.uint8)

@@ -32,7 +32,7 @@ FILL = Light((0.8, 0.1, 0.45), (0.34, 0.38, 0.46))
 
 @dataclass(frozen=True)
 class Look:
-    """background: behind the solid view; panel: behind the flat one and the bars; tissue, inside: of the mesh from
+    """background: behind everything; panel: behind words on the tongue; tissue, inside: of the mesh from
     outside and from inside; flat: of the cut in the flat view; coils: one after the other, again from the first when
     there are more; warning: a coil that does not count."""
 
@@ -64,7 +64,7 @@ class Look:
 
 # Okabe and Ito's palette, which people with any colour vision can tell apart, lightened or darkened for the ground.
 DARK = Look(
-    background=colour("21252c"),
+    background=colour("1d2127"),
     panel=colour("191c21"),
     line=colour("4a515c"),
     text=colour("eceff3"),
@@ -80,7 +80,7 @@ DARK = Look(
     coils=tuple(map(colour, ("f5d547", "4fc3f7", "5fd38d", "ff9e57", "d6a3ff", "ffffff"))),
 )
 LIGHT = Look(
-    background=colour("e9ecf0"),
+    background=colour("f1f3f6"),
     panel=colour("ffffff"),
     line=colour("aab1bc"),
     text=colour("16191e"),

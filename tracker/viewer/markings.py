@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..pose import CoilState, FloatArray, PoseStatus
 from .camera import Layout, Projection, View
 from .look import Colour, Look
-from .overlay import Marks, Typeface
+from .overlay import Marks, Taken, Typeface
 from .scene import COIL_WORDS, STATUS_WORDS, Moment, Scene
 
 SIGMA_SHOWN = 4.0  # a bar's full height; what is beyond has its number
 SIGMA_MARK = 3.0
 SCALE_MM = 10.0
+SLAB_PX = 6.0  # of one shade in the cut
 
 
 @dataclass(frozen=True)
@@ -43,23 +43,27 @@ class Legend:
     colours: tuple[Colour, Colour]
 
 
-def spans(polygon: FloatArray, top: int, bottom: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The inside of a closed polygon (s, 2) row by row: rows (r,), and from where to where (r,), pixels.
+def slabs(polygon: FloatArray, highest_px: float) -> tuple[FloatArray, FloatArray]:
+    """The inside of a closed polygon (s, 2) as trapezoids with level edges: upper and lower ones (n, 3), each left,
+    right, height.
 
-    A point is inside where a line from it crosses the edges an odd number of times; a row has as many spans as it
-    has pieces inside. Rows from `top` to before `bottom` only.
+    A point is inside where a level line from it crosses the sides an odd number of times. Between two heights where
+    the polygon has corners its sides are straight, so that the trapezoids fill it exactly; none is higher than asked.
     """
     first, second = polygon, np.roll(polygon, -1, axis=0)
-    rows = np.arange(
-        max(top, int(polygon[:, 1].min())), min(bottom, int(polygon[:, 1].max()) + 1), dtype=np.float64
-    )
-    middle = rows[:, None] + 0.5
-    crossed = (first[:, 1] <= middle) != (second[:, 1] <= middle)  # (rows, s)
-    row, edge = np.nonzero(crossed)
-    (x, y), (to_x, to_y) = first[edge].T, second[edge].T
-    at = x + (rows[row] + 0.5 - y) * (to_x - x) / (to_y - y)
-    order = np.lexsort((at, row))
-    return rows[row[order][::2]], at[order][::2], at[order][1::2]
+    low, high = polygon[:, 1].min(), polygon[:, 1].max()
+    heights = np.unique(np.concatenate([polygon[:, 1], np.arange(low, high, highest_px)]))
+    middle = 0.5 * (heights[:-1] + heights[1:])
+    slab, side = np.nonzero((first[:, 1] <= middle[:, None]) != (second[:, 1] <= middle[:, None]))
+    (x, y), (to_x, to_y) = first[side].T, second[side].T
+    slope = (to_x - x) / (to_y - y)
+    order = np.lexsort((x + (middle[slab] - y) * slope, slab))
+    slab, x, y, slope = slab[order], x[order], y[order], slope[order]
+    edges = []
+    for height in (heights[slab], heights[slab + 1]):
+        at = x + (height - y) * slope
+        edges.append(np.column_stack([at[::2], at[1::2], height[::2]]))
+    return edges[0], edges[1]
 
 
 class Markings:
@@ -69,11 +73,11 @@ class Markings:
         self._scene, self._look, self._layout, self._typeface = scene, look, layout, typeface
         self._stroke = max(1.0, layout.font_px / 9)
         self._marks = Marks(typeface)
-        self._always: NDArray[np.float32] | None = None
+        self._always: Taken | None = None
 
     def in_space(
         self, moment: Moment, projection: Projection, tongue: Section, trails: Trails | None
-    ) -> NDArray[np.float32]:
+    ) -> Taken:
         """On the tongue in three dimensions, with depths."""
         if self._scene.palate is not None:
             points = projection.pixels(self._scene.palate)
@@ -88,7 +92,7 @@ class Markings:
         tongue: Section,
         ghost: Section | None,
         trails: Trails | None,
-    ) -> NDArray[np.float32]:
+    ) -> Taken:
         """On the mid-sagittal cut."""
         look, stroke = self._look, self._stroke
         outline = projection.pixels(tongue.outline)
@@ -105,19 +109,19 @@ class Markings:
     def _fill(self, outline: FloatArray) -> None:
         """The cut's inside, paler above; closed by a straight line where the mesh is open."""
         area = self._layout.flat
-        rows, left, right = spans(outline[:, :2], area.y, area.y + area.height)
-        shade = 1.06 - 0.34 * (rows - area.y) / area.height
-        self._marks.bars(left, rows, right, rows + 1.0, np.clip(np.outer(shade, self._look.flat), 0.0, 1.0))
+        upper, lower = slabs(outline[:, :2], SLAB_PX)
+        shade = 1.06 - 0.34 * (upper[:, 2] - area.y) / area.height
+        self._marks.slabs(upper, lower, np.clip(np.outer(shade, self._look.flat), 0.0, 1.0))
 
     def around(
         self, moment: Moment, view: View, solid: Projection, flat: Projection, legend: Legend | None
-    ) -> NDArray[np.float32]:
+    ) -> Taken:
         """Words, numbers and bars, on top of everything."""
         if self._always is None:
             self._directions(flat)
             self._scale_of_bars()
             self._always = self._marks.taken()
-        self._marks.rows(self._always)
+        self._marks.again(self._always)
         for projection in (solid, flat):
             self._names(moment, projection)
         self._status(moment, view)
@@ -217,8 +221,8 @@ class Markings:
         shares = np.linspace(0.0, 1.0, steps)[:, None]
         colours = (1 - shares) * legend.colours[0] + shares * legend.colours[1]
         edges = left + (right - left) * np.arange(steps + 1) / steps
-        tops = np.full(steps, bottom - typeface.line_px)
-        marks.bars(edges[:-1], tops + 2, edges[1:], tops + typeface.size_px, colours)
+        for step, colour in enumerate(colours):
+            marks.bar(edges[step], bottom - typeface.line_px + 2, edges[step + 1], bottom - 3, colour)
         marks.text(right + 5, bottom - typeface.line_px, high, look.text)
 
     def _directions(self, flat: Projection) -> None:

@@ -39,6 +39,12 @@ class Offscreen:
             self._plain = self._target(0)
             self.renderer = Renderer(self._context, scene, size, look)
 
+    @property
+    def rasteriser(self) -> str:
+        """What draws: the graphics card's name, or a software rasteriser's."""
+        with self._context:
+            return str(self._context.info["GL_RENDERER"])
+
     def picture(self, moment: Moment, view: View) -> NDArray[np.uint8]:
         """(height, width, 3) red, green and blue, the upper row first."""
         with self._context:

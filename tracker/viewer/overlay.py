@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +17,11 @@ from .shaders import (
     BALL_FRAGMENT,
     BALL_VERTEX,
     BAR_FRAGMENT,
+    BAR_VERTEX,
     LETTER_FRAGMENT,
+    LETTER_VERTEX,
     LINE_FRAGMENT,
     LINE_VERTEX,
-    RECTANGLE_VERTEX,
 )
 
 if TYPE_CHECKING:
@@ -27,8 +29,10 @@ if TYPE_CHECKING:
 
 BAR, LINE, BALL, LETTER = range(4)
 """The kinds of marks, in the order in which they are drawn."""
-COLUMNS = 16
-"""kind, ends (4), depths (2), thickness, colour (4), corners in the atlas (4)."""
+COLUMNS = 15
+"""ends (4), depths (2), thickness, colour (4), corners in the atlas (4) or, of a bar, its lower ends (2)."""
+ENDS, DEPTHS, COLOUR, CORNERS = slice(0, 4), slice(4, 6), slice(7, 10), slice(11, 15)
+THICKNESS, ALPHA = 6, 10
 ATLAS_PX = 512
 NEAREST_DEPTH = -1.0
 
@@ -82,13 +86,12 @@ class Typeface:
         """(n, COLUMNS) the text's letters in black, its upper left corner at 0, 0."""
         letters = np.array([self._letter(letter) for letter in plain_letters(text)]).reshape(-1, 6)
         rows = np.zeros((len(letters), COLUMNS), dtype=np.float32)
-        rows[:, 0] = LETTER
-        rows[:, 1] = np.cumsum(letters[:, 0]) - letters[:, 0]
-        rows[:, 3] = rows[:, 1] + letters[:, 1]
-        rows[:, 4] = self._row_px
-        rows[:, 5:7] = NEAREST_DEPTH
-        rows[:, 11] = 1.0
-        rows[:, 12:16] = letters[:, 2:]
+        rows[:, 0] = np.cumsum(letters[:, 0]) - letters[:, 0]
+        rows[:, 2] = rows[:, 0] + letters[:, 1]
+        rows[:, 3] = self._row_px
+        rows[:, DEPTHS] = NEAREST_DEPTH
+        rows[:, ALPHA] = 1.0
+        rows[:, CORNERS] = letters[:, 2:]
         return rows
 
     def _letter(self, letter: str) -> tuple[float, ...]:
@@ -126,16 +129,31 @@ def plain_letters(text: str) -> str:
     return "".join(letter if " " <= letter <= "~" else "?" for letter in letters)
 
 
+@dataclass(frozen=True)
+class Taken:
+    """Marks of each kind, (n, COLUMNS) each, in the order of the kinds."""
+
+    kinds: tuple[NDArray[np.float32], ...]
+
+    def faint(self, share: float) -> Taken:
+        """The same, seen only by so much."""
+        weaker = np.ones(COLUMNS, dtype=np.float32)
+        weaker[ALPHA] = share
+        return Taken(tuple(rows * weaker for rows in self.kinds))
+
+
 class Marks:
-    """A list of marks; of one kind, the later are on top. Positions are pixels from the upper left, with a depth where it matters."""
+    """A list of marks; of one kind, the later are on top. Positions are pixels from the upper left, with a depth where
+    it matters. What is not a finite number is not drawn."""
 
     def __init__(self, typeface: Typeface) -> None:
         self.typeface = typeface
-        self._parts: list[NDArray[np.float32]] = []
+        self._parts: tuple[list[NDArray[np.float32]], ...] = ([], [], [], [])
 
-    def rows(self, rows: NDArray[np.float32]) -> None:
+    def again(self, marks: Taken) -> None:
         """Marks that were made before."""
-        self._parts.append(rows)
+        for parts, rows in zip(self._parts, marks.kinds, strict=True):
+            parts.append(rows)
 
     def lines(
         self,
@@ -145,93 +163,90 @@ class Marks:
         colours: ArrayLike,
         alphas: ArrayLike = 1.0,
     ) -> None:
-        """Straight lines from points (n, 3) to points (n, 3): x, y, depth. NaN: not drawn.
+        """Straight lines from points (n, 3) to points (n, 3): x, y, depth.
 
         colours: (3,) or (n, 3); alphas: one, or (n,).
         """
         rows = np.zeros((len(first), COLUMNS), dtype=np.float32)
-        rows[:, 0] = LINE
-        rows[:, 1:3], rows[:, 3:5] = first[:, :2], second[:, :2]
-        rows[:, 5], rows[:, 6] = first[:, 2], second[:, 2]
-        rows[:, 7] = thickness
-        rows[:, 8:11] = colours
-        rows[:, 11] = alphas
-        self._parts.append(rows[np.isfinite(rows).all(axis=1)])
+        rows[:, 0:2], rows[:, 2:4] = first[:, :2], second[:, :2]
+        rows[:, 4], rows[:, 5] = first[:, 2], second[:, 2]
+        rows[:, THICKNESS] = thickness
+        rows[:, COLOUR] = colours
+        rows[:, ALPHA] = alphas
+        self._parts[LINE].append(rows)
 
-    def polyline(self, points: FloatArray, thickness: float, colour: Colour, alphas: ArrayLike = 1.0) -> None:
-        """A line through points (n, 3); alphas: one, or (n - 1,)."""
-        self.lines(points[:-1], points[1:], thickness, colour, alphas)
+    def polyline(self, points: FloatArray, thickness: float, colour: Colour, alpha: float = 1.0) -> None:
+        """A line through points (n, 3)."""
+        self.lines(points[:-1], points[1:], thickness, colour, alpha)
 
     def balls(self, places: FloatArray, radii: FloatArray, colours: FloatArray) -> None:
-        """At places (n, 3): x, y, depth; radii (n,) pixels, colours (n, 3). NaN: not drawn."""
+        """At places (n, 3): x, y, depth; radii (n,) pixels, colours (n, 3)."""
         rows = np.zeros((len(places), COLUMNS), dtype=np.float32)
-        rows[:, 0] = BALL
-        rows[:, 1:3] = places[:, :2]
-        rows[:, 5:7] = places[:, 2:]
-        rows[:, 7] = radii
-        rows[:, 8:11], rows[:, 11] = colours, 1.0
-        self._parts.append(rows[np.isfinite(rows).all(axis=1)])
+        rows[:, 0:2] = places[:, :2]
+        rows[:, DEPTHS] = places[:, 2:]
+        rows[:, THICKNESS] = radii
+        rows[:, COLOUR], rows[:, ALPHA] = colours, 1.0
+        self._parts[BALL].append(rows)
 
-    def bars(
-        self,
-        left: FloatArray,
-        top: FloatArray,
-        right: FloatArray,
-        bottom: FloatArray,
-        colours: FloatArray,
-        alpha: float = 1.0,
-    ) -> None:
-        """Filled rectangles, n of each; colours: (3,) or (n, 3)."""
-        rows = np.zeros((len(left), COLUMNS), dtype=np.float32)
-        rows[:, 0] = BAR
-        rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4] = left, top, right, bottom
-        rows[:, 5:7] = NEAREST_DEPTH
-        rows[:, 8:11], rows[:, 11] = colours, alpha
-        self._parts.append(rows)
+    def slabs(self, upper: FloatArray, lower: FloatArray, colours: ArrayLike) -> None:
+        """Trapezoids between level edges, upper (n, 3) and lower (n, 3): left, right, height; colours (n, 3)."""
+        rows = np.zeros((len(upper), COLUMNS), dtype=np.float32)
+        rows[:, 0], rows[:, 2], rows[:, 1] = upper.T
+        rows[:, 11], rows[:, 12], rows[:, 3] = lower.T
+        rows[:, DEPTHS] = NEAREST_DEPTH
+        rows[:, COLOUR], rows[:, ALPHA] = colours, 1.0
+        self._parts[BAR].append(rows)
 
     def bar(
-        self, left: float, top: float, right: float, bottom: float, colour: Colour, alpha: float = 1.0
+        self, left: float, top: float, right: float, bottom: float, colour: ArrayLike, alpha: float = 1.0
     ) -> None:
         """One filled rectangle."""
-        corners = np.array([[left], [top], [right], [bottom]])
-        self.bars(*corners, np.array(colour), alpha)
+        row = np.zeros((1, COLUMNS), dtype=np.float32)
+        row[0, ENDS] = left, top, right, bottom
+        row[0, 11:13] = left, right
+        row[0, DEPTHS] = NEAREST_DEPTH
+        row[0, COLOUR], row[0, ALPHA] = colour, alpha
+        self._parts[BAR].append(row)
 
     def text(self, x: float, y: float, text: str, colour: Colour) -> None:
         """One line; x, y: the upper left corner."""
         move = np.zeros(COLUMNS, dtype=np.float32)
-        move[1] = move[3] = round(x)
-        move[2] = move[4] = round(y)
-        move[8:11] = colour
-        self._parts.append(self.typeface.row(text) + move)
+        move[0] = move[2] = round(x)
+        move[1] = move[3] = round(y)
+        move[COLOUR] = colour
+        self._parts[LETTER].append(self.typeface.row(text) + move)
 
-    def taken(self) -> NDArray[np.float32]:
-        """(n, COLUMNS) everything gathered so far, which is forgotten."""
-        rows = np.concatenate(self._parts) if self._parts else np.zeros((0, COLUMNS), dtype=np.float32)
-        self._parts = []
-        return rows
+    def taken(self) -> Taken:
+        """Everything gathered so far, which is forgotten."""
+        nothing = np.zeros((0, COLUMNS), dtype=np.float32)
+        kinds = [np.concatenate([nothing, *parts]) for parts in self._parts]
+        self._parts = ([], [], [], [])
+        return Taken(tuple(rows[np.isfinite(rows.sum(axis=1))] for rows in kinds))
 
 
 class MarkDrawer:
     """Draws rows of marks, one call for each kind."""
 
     def __init__(self, context: moderngl.Context) -> None:
-        self._kinds = {
-            BAR: MarkKind(context, RECTANGLE_VERTEX, BAR_FRAGMENT),
-            LINE: MarkKind(context, LINE_VERTEX, LINE_FRAGMENT),
-            BALL: MarkKind(context, BALL_VERTEX, BALL_FRAGMENT),
-            LETTER: MarkKind(context, RECTANGLE_VERTEX, LETTER_FRAGMENT),
-        }
+        self._kinds = [
+            MarkKind(context, vertex_shader, fragment_shader)
+            for vertex_shader, fragment_shader in (
+                (BAR_VERTEX, BAR_FRAGMENT),
+                (LINE_VERTEX, LINE_FRAGMENT),
+                (BALL_VERTEX, BALL_FRAGMENT),
+                (LETTER_VERTEX, LETTER_FRAGMENT),
+            )
+        ]
 
-    def draw(self, rows: NDArray[np.float32], size: tuple[int, int], atlas: moderngl.Texture) -> None:
-        """rows: (n, COLUMNS); size: of the picture, pixels."""
+    def draw(self, marks: Taken, size: tuple[int, int], atlas: moderngl.Texture) -> None:
+        """size: of the picture, pixels."""
         atlas.use(0)
-        for kind, drawer in self._kinds.items():
-            chosen = rows[rows[:, 0] == kind]
-            if len(chosen):
-                drawer.draw(chosen, size)
+        for drawer, rows in zip(self._kinds, marks.kinds, strict=True):
+            if len(rows):
+                drawer.draw(rows, size)
 
     def release(self) -> None:
-        for drawer in self._kinds.values():
+        for drawer in self._kinds:
             drawer.release()
 
 
@@ -256,7 +271,7 @@ class MarkKind:
     def _make_room(self, rows: int) -> None:
         self._release_buffer()
         self._buffer = self._context.buffer(reserve=4 * COLUMNS * rows, dynamic=True)
-        layout, names = ["4x"], []
+        layout, names = [], []
         for name, part in (
             ("in_ends", 4),
             ("in_depths", 2),

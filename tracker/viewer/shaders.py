@@ -55,6 +55,10 @@ void main() {
 }
 """.replace("WIDTH", str(TEXTURE_WIDTH))
 
+# The light is worked out at the vertices, which lie a few pixels apart: a software rasteriser pays for every pixel of
+# such small triangles several times over. Colours are squared before light is added up and rooted afterwards, near enough
+# to what screens do. Light wraps round the edge of the shadow, red farther than blue, as it does under skin; wet tissue
+# has a sharp and a dull gloss. The eye is taken to be far away.
 TONGUE_VERTEX = """
 #version 330
 uniform sampler2D positions;
@@ -67,68 +71,73 @@ uniform vec3 tissue;
 uniform vec3 near_colour;
 uniform vec3 far_colour;
 uniform vec3 unknown;
-in vec2 in_skin;
-out vec3 normal;
-out vec3 body;
-out vec2 skin;
-void main() {
-    ivec2 at = ivec2(gl_VertexID % WIDTH, gl_VertexID / WIDTH);
-    gl_Position = to_clip * vec4(texelFetch(positions, at, 0).xyz, 1.0);
-    normal = to_camera * texelFetch(normals, at, 0).xyz;
-    body = tissue;
-    if (by_value == 1) {
-        float value = texelFetch(values, at, 0).x;
-        body = value < 0.0 ? unknown : mix(near_colour, far_colour, value);
-    }
-    body *= body;
-    skin = in_skin;
-}
-""".replace("WIDTH", str(TEXTURE_WIDTH))
-
-# Colours are squared before light is added up and rooted afterwards, near enough to what screens do. Light wraps
-# round the edge of the shadow, red farther than blue, as it does under skin; wet tissue has a sharp and a dull gloss.
-# The eye is taken to be far away, which saves two roots in every pixel.
-TONGUE_FRAGMENT = """
-#version 330
-uniform sampler2D grain;       // two slopes and a tint
-uniform vec3 inside;
 uniform vec3 ambient;
 uniform vec3 light_ways[2];
 uniform vec3 light_colours[2];
 uniform vec3 between;          // half way between the first light and the eye
-in vec3 normal;
-in vec3 body;
+in vec2 in_skin;
+out vec3 lit;
+out vec2 shine;                // the gloss outside, the light inside
+out vec2 skin;
+const vec3 WRAP = vec3(0.42, 0.16, 0.13);
+const vec3 RIM = vec3(0.50, 0.17, 0.15);
+vec3 light_on(vec3 n) {
+    return ambient * (0.7 + 0.3 * n.y)
+        + light_colours[0] * max((dot(n, light_ways[0]) + WRAP) / (1.0 + WRAP), 0.0)
+        + light_colours[1] * max((dot(n, light_ways[1]) + WRAP) / (1.0 + WRAP), 0.0);
+}
+void main() {
+    ivec2 at = ivec2(gl_VertexID % WIDTH, gl_VertexID / WIDTH);
+    gl_Position = to_clip * vec4(texelFetch(positions, at, 0).xyz, 1.0);
+    vec3 n = to_camera * texelFetch(normals, at, 0).xyz;
+    vec3 body = tissue;
+    if (by_value == 1) {
+        float value = texelFetch(values, at, 0).x;
+        body = value < 0.0 ? unknown : mix(near_colour, far_colour, value);
+    }
+    float grazing = 1.0 - max(n.z, 0.0);
+    lit = light_on(n) * (body * body + RIM * grazing * grazing * grazing);
+    float slope = max(dot(n, between), 0.0);
+    shine = vec2(0.46 * pow(slope, 34.0) + 0.13 * pow(slope, 9.0), light_on(-n).y);
+    skin = in_skin;
+}
+""".replace("WIDTH", str(TEXTURE_WIDTH))
+
+TONGUE_FRAGMENT = """
+#version 330
+uniform sampler2D grain;       // how bright the surface's unevenness is; how it breaks the gloss
+uniform vec3 inside;
+in vec3 lit;
+in vec2 shine;
 in vec2 skin;
 out vec4 colour;
-const vec3 WRAP = vec3(0.42, 0.16, 0.13);
-const vec3 SHARE = 1.0 / (1.0 + WRAP);
 void main() {
-    vec3 bumps = texture(grain, skin).xyz - 0.5;
-    vec3 facing = gl_FrontFacing ? normal : -normal;
-    vec3 own = gl_FrontFacing ? body : inside * inside;
-    float wet = gl_FrontFacing ? 1.0 : 0.3;
-    vec3 n = normalize(facing + vec3(0.30 * bumps.xy, 0.0));
-    vec3 light = ambient * (0.7 + 0.3 * n.y)
-        + light_colours[0] * max((dot(n, light_ways[0]) + WRAP) * SHARE, 0.0)
-        + light_colours[1] * max((dot(n, light_ways[1]) + WRAP) * SHARE, 0.0);
-    float slope = max(dot(n, between), 0.0);
-    float eight = slope * slope; eight *= eight; eight *= eight;
-    float sharp = eight * eight; sharp *= sharp; sharp *= sharp;
-    float grazing = 1.0 - max(n.z, 0.0);
-    vec3 rim = vec3(0.50, 0.17, 0.15) * (grazing * grazing * grazing);
-    colour = vec4(sqrt(light * (own * (1.0 + 0.7 * bumps.z) + wet * rim) + wet * (0.38 * sharp + 0.10 * eight)), 1.0);
+    vec2 uneven = texture(grain, skin).xy * 2.0;
+    vec3 outer = lit * uneven.x + shine.x * uneven.y;
+    colour = vec4(sqrt(gl_FrontFacing ? outer : inside * inside * shine.y), 1.0);
 }
 """
+
+GHOST_VERTEX = """
+#version 330
+uniform sampler2D positions;
+uniform sampler2D normals;
+uniform mat4 to_clip;
+uniform mat3 to_camera;
+out float edge;
+void main() {
+    ivec2 at = ivec2(gl_VertexID % WIDTH, gl_VertexID / WIDTH);
+    gl_Position = to_clip * vec4(texelFetch(positions, at, 0).xyz, 1.0);
+    edge = 1.0 - abs((to_camera * texelFetch(normals, at, 0).xyz).z);
+}
+""".replace("WIDTH", str(TEXTURE_WIDTH))
 
 GHOST_FRAGMENT = """
 #version 330
 uniform vec3 tint;
-in vec3 normal;
+in float edge;
 out vec4 colour;
-void main() {
-    float edge = 1.0 - abs(normalize(normal).z);
-    colour = vec4(tint, 0.10 + 0.55 * edge * edge);
-}
+void main() { colour = vec4(tint, 0.12 + 0.55 * edge * edge); }
 """
 
 # Marks: bars, lines, balls and letters, each a quadrilateral in pixels with edges softened over one pixel. One programme
@@ -156,13 +165,14 @@ void put(vec2 place, float depth) {
 }
 """
 
-RECTANGLE_VERTEX = (
+# Upper and lower edges are level, the sides may slant: in_letter begins with the lower edge's ends.
+BAR_VERTEX = (
     _MARK_HEAD
     + """
 void main() {
     vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1);
-    put(mix(in_ends.xy, in_ends.zw, corner), in_depths.x);
-    letter = mix(in_letter.xy, in_letter.zw, corner);
+    vec2 side = mix(vec2(in_ends.x, in_letter.x), vec2(in_ends.z, in_letter.y), corner.x);
+    put(vec2(mix(side.x, side.y, corner.y), mix(in_ends.y, in_ends.w, corner.y)), in_depths.x);
 }
 """
 )
@@ -173,6 +183,17 @@ flat in vec4 tint;
 out vec4 colour;
 void main() { colour = tint; }
 """
+
+LETTER_VERTEX = (
+    _MARK_HEAD
+    + """
+void main() {
+    vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1);
+    put(mix(in_ends.xy, in_ends.zw, corner), in_depths.x);
+    letter = mix(in_letter.xy, in_letter.zw, corner);
+}
+"""
+)
 
 LETTER_FRAGMENT = """
 #version 330

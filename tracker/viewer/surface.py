@@ -15,7 +15,6 @@ from .shaders import (
     NORMALS_FRAGMENT,
     POSITIONS_FRAGMENT,
     TEXTURE_WIDTH,
-    TONGUE_VERTEX,
     WHOLE_VERTEX,
 )
 
@@ -131,11 +130,11 @@ class Surface:
 
 
 def tongue_vertex_array(
-    programs: SurfacePrograms, fragment_shader: str
+    programs: SurfacePrograms, vertex_shader: str, fragment_shader: str
 ) -> tuple[moderngl.Program, moderngl.VertexArray]:
-    """A programme that draws a surface with this fragment shader, and the faces it draws."""
+    """A programme that draws a surface with these shaders, and the faces it draws."""
     context = programs.context
-    program = context.program(TONGUE_VERTEX, fragment_shader=fragment_shader)
+    program = context.program(vertex_shader, fragment_shader=fragment_shader)
     parts = [(programs.skin, "2f", "in_skin")] if "in_skin" in program else []
     return program, context.vertex_array(program, parts, index_buffer=programs.faces, index_element_size=4)
 
