@@ -44,6 +44,8 @@ class Argument:
 
     def __str__(self) -> str:
         unit = f" ({self.unit})" if self.unit else ""
+        if self.tag == "T":
+            unit = " (type T or F)"
         return f"{self.count} x {self.name}{unit}" if self.count else f"{self.name}{unit}"
 
 

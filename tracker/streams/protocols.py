@@ -166,7 +166,7 @@ def _presets() -> str:
                 (
                     f"`{t.name}`",
                     "-1..1" if t.low < 0 else "0..1",
-                    " + ".join(_term(*term) for term in t.terms),
+                    _sum(t.terms),
                 )
                 for t in preset.targets
             ]
@@ -176,8 +176,13 @@ def _presets() -> str:
     return "\n\n".join(parts)
 
 
-def _term(shape: str, weight: float) -> str:
-    return shape if weight == 1.0 else f"{weight:g} {shape}"
+def _sum(terms: Sequence[tuple[str, float]]) -> str:
+    """ "flat - 0.5 narrow"."""
+    words = " ".join(
+        f"{'-' if weight < 0 else '+'} {'' if abs(weight) == 1.0 else f'{abs(weight):g} '}{shape}"
+        for shape, weight in terms
+    )
+    return words.removeprefix("+ ")
 
 
 def _channels(channels: Iterable[object]) -> str:
