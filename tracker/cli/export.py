@@ -53,7 +53,7 @@ def run_export(args: argparse.Namespace) -> int:
     poses, model = poses_and_model(args.poses, args.model)
     poses, other = replayed(poses, model, args.speaker)
     palate = other.palate if other is not None else _palate_of(args.session)
-    keep_apart([target], [Path(args.poses)])
+    keep_apart([target], [Path(args.poses), Path(args.model or poses.model_path)])
     prepare_folder(target)
     frames = range(0, poses.frame_count, args.every)
     _write(args, target, poses, model, frames, palate)
