@@ -5,7 +5,9 @@ Pixels count from the upper left corner, x to the right, y down.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -109,15 +111,22 @@ class Projection:
     matrix: FloatArray
     area: Area
 
+    @cached_property
+    def _to_pixels(self) -> FloatArray:
+        """(4, 4) from homogeneous mm to homogeneous pixels and depth."""
+        x, y, width, height = self.area
+        place = np.eye(4)
+        place[0, 0], place[0, 3] = 0.5 * width, x + 0.5 * width
+        place[1, 1], place[1, 3] = -0.5 * height, y + 0.5 * height
+        return np.ascontiguousarray((place @ self.matrix).T)
+
     def pixels(self, points: FloatArray) -> FloatArray:
         """(n, 3) from points (n, 3) mm: x, y in pixels of the whole picture, and depth from -1 (near) to 1;
         NaN behind the camera."""
-        clip = points @ self.matrix[:, :3].T + self.matrix[:, 3]
-        unit = clip[:, :3] / np.where(clip[:, 3:] > 1e-6, clip[:, 3:], np.nan)
-        x, y, width, height = self.area
-        return np.column_stack(
-            [x + (0.5 + 0.5 * unit[:, 0]) * width, y + (0.5 - 0.5 * unit[:, 1]) * height, unit[:, 2]]
-        )
+        placed = points @ self._to_pixels[:3] + self._to_pixels[3]
+        depth = placed[:, 3:]
+        depth[depth <= 1e-6] = np.nan
+        return np.asarray(placed[:, :3] / depth)
 
     def pixels_per_mm(self, points: FloatArray) -> FloatArray:
         """(n,) how large a millimetre looks at points (n, 3)."""
@@ -129,10 +138,16 @@ class Projection:
 
 def camera_axes(view: View) -> FloatArray:
     """(3, 3): the camera's right, up and backwards (towards the viewer), in the model frame."""
-    yaw, pitch = np.radians([view.yaw_deg, view.pitch_deg])
-    backwards = np.array([np.sin(yaw) * np.cos(pitch), -np.cos(yaw) * np.cos(pitch), np.sin(pitch)])
-    right = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    return np.array([right, np.cross(backwards, right), backwards])
+    yaw, pitch = math.radians(view.yaw_deg), math.radians(view.pitch_deg)
+    across, along = (math.cos(yaw), math.sin(yaw)), (math.sin(yaw), -math.cos(yaw))
+    level, steep = math.cos(pitch), math.sin(pitch)
+    return np.array(
+        [
+            [*across, 0.0],
+            [-along[0] * steep, -along[1] * steep, level],
+            [along[0] * level, along[1] * level, steep],
+        ]
+    )
 
 
 def solid_projection(view: View, area: Area) -> Projection:

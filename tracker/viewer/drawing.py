@@ -70,6 +70,7 @@ class Renderer:
         self._values.filter = (context.NEAREST, context.NEAREST)
         self._grain = context.texture((GRAIN_PX, GRAIN_PX), 2, grain().tobytes())
         self._drawer = MarkDrawer(context)
+        self._aside = context.simple_framebuffer((1, 1))
         self._past: deque[tuple[float, FloatArray]] = deque()
         self._coloured_by: object = None
         self._typeface: Typeface | None = None
@@ -110,11 +111,14 @@ class Renderer:
         ghost = None if view.ghost is None else self._section(self._ghost)
         context = self._context
         self._draw_tongue(framebuffer, view, solid, legend is not None)
+        # A software rasteriser starts when the target changes: now, while the marks are put together.
+        self._aside.clear()
         trails = self._trails(moment, view)
         in_space = self._markings.in_space(moment, solid, tongue, trails)
         in_plane = self._markings.in_plane(moment, self._flat_projection, tongue, ghost, trails)
         around = self._markings.around(moment, view, solid, self._flat_projection, legend)
 
+        framebuffer.use()
         context.enable(context.BLEND)
         context.blend_func = context.SRC_ALPHA, context.ONE_MINUS_SRC_ALPHA
         self._limit(framebuffer, self.layout.solid)
@@ -235,7 +239,7 @@ class Renderer:
         if self._typeface is not None:
             self._typeface.release()
         things = (
-            self._drawer, self._tongue, self._ghost, self._tongue_array, self._ghost_array,
+            self._drawer, self._aside, self._tongue, self._ghost, self._tongue_array, self._ghost_array,
             self._values, self._grain, self._tongue_program,
             self._ghost_program, self._programs,
         )  # fmt: skip
