@@ -267,5 +267,5 @@ def grain() -> NDArray[np.uint8]:
     bumps, blotches = noise(22.0), noise(5.0)
     slope = bumps - np.roll(bumps, (1, 1), axis=(0, 1))  # towards the light
     brightness = 1.0 + 0.06 * slope / slope.std() + 0.05 * blotches
-    gloss = 1.0 + 0.35 * slope / slope.std()
+    gloss = 1.0 + 0.28 * slope / slope.std()
     return np.clip(128 * np.stack([brightness, gloss], axis=-1), 0, 255).astype(np.uint8)
