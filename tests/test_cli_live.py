@@ -270,7 +270,7 @@ def test_one_message_with_other_arguments_does_not_hide_the_stream(capsys):
     monitor = Heard()
     monitor.frame(0)
     monitor.hear("/tongue/frame", 7)
-    so_far = _report(monitor, 0, 0)
+    so_far = _report(monitor, 0, 0, 0)
     assert "frame 0 ok  sigma +0.50" in (told := capsys.readouterr().err)
     assert "1 messages with other arguments" in told
     monitor.frame(1)

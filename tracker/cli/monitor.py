@@ -83,7 +83,7 @@ def _listen(receiver: socket.socket, monitor: Monitor, seconds: float | None) ->
 
     start = time.perf_counter()
     end = start + (float("inf") if seconds is None else seconds)
-    report, so_far = start + REPORT_PERIOD_S, (0, 0)
+    report, so_far = start + REPORT_PERIOD_S, (0, 0, 0)
     while (now := time.perf_counter()) < end:
         if now >= report:
             so_far = _report(monitor, *so_far)
@@ -97,14 +97,19 @@ def _listen(receiver: socket.socket, monitor: Monitor, seconds: float | None) ->
         monitor.receive(datagram, (sender[0], sender[1]), time.perf_counter_ns())
 
 
-def _report(monitor: Monitor, frames_before: int, misfits_before: int) -> tuple[int, int]:
-    """One line a second while frames arrive. Returns the frames and the misfits so far."""
+def _report(
+    monitor: Monitor, frames_before: int, misfits_before: int, datagrams_before: int
+) -> tuple[int, int, int]:
+    """One line a second while anything arrives. Returns the frames, the misfits and the datagrams so far."""
     from ..pose import PoseStatus
 
     frames = sum(stream.frames for stream in monitor.streams.values())
     misfits = sum(seen.misfits for seen in monitor.seen.values())
+    so_far = frames, misfits, monitor.datagrams
     if frames == frames_before:
-        return frames, misfits
+        if monitor.datagrams > datagrams_before:
+            _say(f"{monitor.datagrams - datagrams_before} datagrams/s")
+        return so_far
     others = f", {misfits - misfits_before} messages with other arguments" if misfits > misfits_before else ""
     newest, quality, sigma = (
         seen.fitting if (seen := monitor.seen.get(path)) else []
@@ -112,7 +117,7 @@ def _report(monitor: Monitor, frames_before: int, misfits_before: int) -> tuple[
     )
     if not (newest and quality and sigma):
         _say(f"{frames - frames_before} frames/s{others}")
-        return frames, misfits
+        return so_far
     lost = sum(stream.lost for stream in monitor.streams.values())
     number, _, state = newest
     residual, coils, latency = quality
@@ -123,7 +128,7 @@ def _report(monitor: Monitor, frames_before: int, misfits_before: int) -> tuple[
         f"{frames - frames_before} frames/s  frame {number} {name}  sigma {weights}  "
         f"residual {residual:.2f} mm  coils {coils}  latency {latency:.2f} ms  lost {lost}{others}"
     )
-    return frames, misfits
+    return so_far
 
 
 def _say(text: str) -> None:
