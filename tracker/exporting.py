@@ -74,34 +74,26 @@ def motion_glb(
     palate: Palate | None = None,
     coils: bool = False,
     sigmas: float | None = None,
-) -> bytes:
-    """The take as an animated glTF. The raw weights that become 0 and 1 are the smallest and largest of the frames, or
-    mean -+ `sigmas` sigma for a model that will be driven live as well.
+) -> tuple[bytes, int]:
+    """The take as an animated glTF, and how many of its frames leave 0..1.
 
-    Raises InputError where a frame leaves that range, and for coils where there are none.
+    The raw weights that become 0 and 1 are the smallest and largest of the frames, or mean -+ `sigmas` sigma for a
+    model that will be driven live as well; only then can a frame be outside, and a program that clamps shows it wrong.
+    Raises InputError for coils where there are none.
     """
     motion = motion_of(model, poses, frames)
     if sigmas is None:
         rebased = Rebased.of_clip(motion.weights)
     else:
         rebased = Rebased.of_range(motion.speaker.mean, motion.speaker.sigma, sigmas)
-        _check_within(motion, rebased, frames, sigmas)
+    outside = (np.abs(rebased.to_unit(motion.weights) - 0.5) > 0.5 + 1e-9).any(axis=1)
     shown = (poses.roles, poses.coils[frames]) if coils else None
     if shown is not None and np.isnan(shown[1]).all():
         raise InputError("there is no coil in any of these poses, so none can be shown.")
     line = None if palate is None else np.column_stack([np.zeros(len(palate.curve[0])), *palate.curve])
     clip = (poses.times_s[frames], motion.weights)
-    return glb(motion.speaker, rebased, model.name, clip, line, shown, motion.names)
-
-
-def _check_within(motion: Motion, rebased: Rebased, frames: Sequence[int], sigmas: float) -> None:
-    away = np.abs((motion.weights - motion.speaker.mean) / motion.speaker.sigma)
-    outside = np.flatnonzero((away > sigmas * (1 + 1e-9)).any(axis=1))
-    if len(outside):
-        needed = np.ceil(10 * away.max()) / 10
-        raise InputError(
-            f"--sigmas {sigmas:g}: frame {frames[outside[0]]} is farther from the mean; this take needs {needed:g}."
-        )
+    content = glb(motion.speaker, rebased, model.name, clip, line, shown, motion.names)
+    return content, int(outside.sum())
 
 
 def numbered(target: Path, frame: int) -> Path:

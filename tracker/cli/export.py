@@ -114,7 +114,14 @@ def _write(
 
     match target.suffix.lower():
         case ".glb":
-            write_atomically(target, motion_glb(model, poses, frames, palate, args.coils, args.sigmas))
+            content, outside = motion_glb(model, poses, frames, palate, args.coils, args.sigmas)
+            write_atomically(target, content)
+            if outside:
+                print(
+                    f"note: {outside} of {len(frames)} frames leave the {args.sigmas:g} sigma that 0 and 1 stand for; "
+                    "programs that clamp weights, such as Blender, show them wrong",
+                    file=sys.stderr,
+                )
         case ".csv":
             rows = motion_csv(model, poses, frames)
             write_atomically(target, lambda file: file.writelines(row.encode() for row in rows))
