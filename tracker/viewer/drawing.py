@@ -144,13 +144,13 @@ class Renderer:
         context, area = self._context, self.layout.solid
         framebuffer.use()
         framebuffer.depth_mask = True
-        framebuffer.scissor = None
+        self._limit(framebuffer, None)
         framebuffer.clear(*self.look.background, depth=1.0)
         self._limit(framebuffer, area)
         framebuffer.viewport = self._from_below(area)
         for program in (self._tongue_program, self._ghost_program):
-            program["to_clip"].write(np.ascontiguousarray(solid.matrix.T, dtype="f4").tobytes())
-            program["to_camera"].write(np.ascontiguousarray(camera_axes(view).T, dtype="f4").tobytes())
+            program["to_clip"] = tuple(solid.matrix.T.ravel())
+            program["to_camera"] = tuple(camera_axes(view).T.ravel())
         self._tongue_program["by_value"] = int(by_value)
         self._values.use(2)
         self._grain.use(3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +90,9 @@ def egl_context() -> moderngl.Context:
     except ImportError as reason:
         raise InputError("drawing needs the extra 'viewer': pip install 'tonguetrack[viewer]'.") from reason
     try:
-        return moderngl.create_context(standalone=True, backend="egl", require=330)
+        create: Any = moderngl.create_context  # its own annotation of `backend` is wrong
+        context: moderngl.Context = create(standalone=True, backend="egl", require=330)
+        return context
     except Exception as reason:  # the loader raises whatever its platform makes it stumble over
         raise InputError(
             NO_EGL.format(reason=str(reason).splitlines()[0] if str(reason) else "no reason given")

@@ -118,13 +118,15 @@ class Surface:
                 texture.filter = (context.NEAREST, context.NEAREST)
         self._shapes.write(values.tobytes())
         self.speaker = speaker
-        self._followed_model = speaker.at(self._followed_vertices)
+        self._followed_model = speaker.at(self._followed_vertices.tolist())
         self._shown = np.zeros(0)
 
     def release(self) -> None:
-        for thing in (*self._passes, *self._targets, self.positions, self.normals):
-            thing.release()
-        for texture in (self._shapes, self._weights):
+        for vertex_array in self._passes:
+            vertex_array.release()
+        for target in self._targets:
+            target.release()
+        for texture in (self.positions, self.normals, self._shapes, self._weights):
             if texture is not None:
                 texture.release()
 
