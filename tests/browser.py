@@ -116,6 +116,7 @@ class Tab:
         return self
 
     def __exit__(self, *_):
+        self.call("Page.close")
         self._stack.close()
 
     def call(self, method: str, **parameters):

@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 from tonguetrack.tracker.streams.feed import FeedNumbers
 from tonguetrack.tracker.streams.sink import LiveNumbers
 
-WAIT_S = 30.0
+WAIT_S = 60.0
 SIZE = (900, 620)
 COIL_COLOURS = ((0xE6, 0x9F, 0x00), (0x56, 0xB4, 0xE9), (0x00, 0x9E, 0x73))
 TISSUE, GHOST = (0xC4, 0x60, 0x6A), (0x4A, 0x74, 0xB8)  # of the light page
@@ -62,7 +62,8 @@ def tab(browser, server):
 
 @pytest.fixture(autouse=True)
 def at_rest(feed, tab):
-    """Every test begins with the tongue at rest, without ghost and delay."""
+    """Every test begins with the tongue at rest, in the tab that is in front: others are not drawn."""
+    tab.call("Page.bringToFront")
     feed.show(REST)
     wait_for_pose(tab, REST)
 
@@ -381,3 +382,20 @@ def test_it_connects_again_by_itself_after_the_server_was_restarted(browser, fee
             tab.wait("document.querySelector('#connection').innerText == 'connected'", WAIT_S)
             wait_for_pose(tab, RAISED)
             assert fleshy(tab.picture("#solid")).mean() > 0.05
+
+
+def test_the_end_of_the_run_is_told_and_the_next_run_is_shown_at_the_same_address(browser, tmp_path):
+    with (
+        feeding.Feeder(tmp_path / "first", title="the first") as first,
+        feeding.Served(first.folder) as served,
+        browser.open(served.url, *SIZE) as tab,
+    ):
+        wait_for_pose(tab, REST)
+        first.close()
+        assert served.process.wait(WAIT_S) == 0
+        tab.wait("document.querySelector('#connection').innerText == 'run has ended'")
+        with feeding.Feeder(tmp_path / "second", title="the second") as second:
+            second.show(RAISED)
+            with feeding.Served(second.folder, f"127.0.0.1:{served.port}"):
+                tab.wait("document.querySelector('#title').innerText == 'the second'", WAIT_S)
+                wait_for_pose(tab, RAISED)

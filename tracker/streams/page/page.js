@@ -178,7 +178,7 @@ function showTexts(pose) {
   const [median, worst] = state?.latency.host_to_solved ?? [null, null];
   $("solve").textContent = median === null ? pose.solveMs.toFixed(2) : `${median.toFixed(2)} / ${worst.toFixed(2)}`;
   $("age").textContent = pose.ageMs.toFixed(1);
-  $("speaker").textContent = pose.fixed ? "the speaker is fixed" : "the speaker is being estimated";
+  $("speaker").textContent = pose.fixed ? "fixed" : "being estimated";
   $("speaker-button").textContent = pose.fixed ? "Free speaker" : "Fix speaker";
   $("speaker-button").dataset.fix = pose.fixed ? "" : "yes";
 }

@@ -208,8 +208,9 @@ def from_page(text: str) -> Seen | Wish:
             return Seen(number)
         case {"do": "take", "on": bool(on), **rest} if set(rest) <= {"name"}:
             word = "start" if on else "stop"
-            name = rest.get("name", "")
-            return _wish("take", CONTROL_TAKE, [word, name] if on and name else [word])
+            match rest.get("name", ""):
+                case str(name):
+                    return _wish("take", CONTROL_TAKE, [word, name] if on and name else [word])
         case {"do": "mark", "text": str(mark), **rest} if not rest:
             return _wish("mark", CONTROL_MARKERS[0], [mark])
         case {"do": "speaker", "fix": bool(fix), **rest} if not rest:
@@ -217,11 +218,11 @@ def from_page(text: str) -> Seen | Wish:
     raise NotUnderstood("not a message of the page")
 
 
-def _wish(what: str, path: str, values: list[object]) -> Wish:
+def _wish(what: str, path: str, values: list[str]) -> Wish:
     from pythonosc.osc_message_builder import OscMessageBuilder
 
     # The same rules as at the other end, so that nothing is passed on that would be ignored there.
-    if control_of(path, values, 0) is None:
+    if control_of(path, list(values), 0) is None:
         raise NotUnderstood(
             f"a {what} takes at most {MAX_CONTROL_TEXT} printable characters, and a take's name letters, digits, "
             "spaces and _-. only"

@@ -143,19 +143,6 @@ class Page:
         self._sending_since_s = None
 
 
-class _Counted(ServerConnection):
-    waiting: Waiting
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)
-        assert isinstance(transport, asyncio.Transport)
-        self.waiting.add(self, transport)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        super().connection_lost(exc)
-        self.waiting.remove(self)
-
-
 class Waiting:
     """The connections that are no WebSocket yet. At most `MAX_WAITING`: whoever dawdles makes way for others."""
 
@@ -176,11 +163,21 @@ class Waiting:
     def remove(self, connection: ServerConnection) -> None:
         self._connections.pop(connection, None)
 
-    def connection(self, *arguments: Any, **options: Any) -> ServerConnection:
-        """A connection that is counted from its first to its last moment."""
-        made = _Counted(*arguments, **options)
-        made.waiting = self
-        return made
+
+def counted(waiting: Waiting) -> type[ServerConnection]:
+    """Connections that wait there from their first to their last moment, unless they are taken out before."""
+
+    class Counted(ServerConnection):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            super().connection_made(transport)
+            assert isinstance(transport, asyncio.Transport)
+            waiting.add(self, transport)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            super().connection_lost(exc)
+            waiting.remove(self)
+
+    return Counted
 
 
 class PageServer:
@@ -245,7 +242,7 @@ class PageServer:
                 self._door.place,
                 self._door.port,
                 process_request=self._answer,
-                create_connection=self._waiting.connection,
+                create_connection=counted(self._waiting),
                 compression=None,
                 max_size=MAX_WISH_BYTES,
                 max_queue=4,

@@ -110,7 +110,6 @@ export class Stream {
     this.acknowledged = 0;
     this.acknowledgedMs = this.heardMs = performance.now();
     this.seenEvery = 1;
-    this.over = false;
     socket.onmessage = (event) => this.receive(event.data);
     socket.onclose = () => this.lost(socket);
   }
@@ -121,6 +120,7 @@ export class Stream {
     if (typeof data === "string") {
       const message = JSON.parse(data);
       if (message.type === "hello") {
+        this.over = false;
         this.pauseMs = FIRST_PAUSE_MS;
         this.seenEvery = message.seen_every;
         this.heard.connection("connected", "good");
