@@ -32,6 +32,7 @@ def build_parser() -> argparse.ArgumentParser:
         simulate,
         take,
         track,
+        view,
     )
 
     parser = argparse.ArgumentParser(
@@ -41,7 +42,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"tonguetrack {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for family in (
-        demo, live, track, export, calibrate, anatomy, files, take, devices, doctor, model, evaluate, experiment,
+        demo, live, track, view, export, calibrate, anatomy, files, take, devices, doctor, model, evaluate, experiment,
         simulate, monitor, shapes, bench,
     ):  # fmt: skip
         family.add_commands(commands)

@@ -36,12 +36,17 @@ def poses_and_model(path: str, model_name: str | None = None) -> tuple[TrackedPo
     given = named_model(model_name) if model_name else None
     poses = read_poses(path, given)
     model = given or _model_of(poses, path)
+    check_model(poses, model, path)
+    return poses, model
+
+
+def check_model(poses: TrackedPoses, model: TongueModel, path: str) -> None:
+    """Raises InputError where the poses of this file belong to another model."""
     if poses.model_fingerprint and poses.model_fingerprint != model.fingerprint:
         raise InputError(
             f"{path}: the poses were tracked with the model {poses.model_name} [{poses.model_fingerprint}], "
             f"but {model.name} is [{model.fingerprint}]; name the right one with --model."
         )
-    return poses, model
 
 
 def _model_of(poses: TrackedPoses, path: str) -> TongueModel:

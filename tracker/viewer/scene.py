@@ -65,7 +65,8 @@ class Scene:
 
     contour: (c,) vertices of the upper surface in the mid-sagittal plane, tip to root.
     roles, correspondences: the tracked coils, and the vertex that each is held to.
-    palate: (p, 3) mm, front to back, or None; title: what this is, for people.
+    palate: (p, 3) mm, front to back, or None; title: what this is, for people; speaker_weights: (m,) of the speaker
+    who is to fit into the picture, None = the mean.
     """
 
     model: TongueModel
@@ -74,6 +75,7 @@ class Scene:
     correspondences: tuple[int, ...]
     palate: FloatArray | None
     title: str
+    speaker_weights: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if len(self.roles) != len(self.correspondences):
@@ -82,6 +84,11 @@ class Scene:
         if wrong:
             raise InputError(
                 f"vertex {wrong[0]} does not exist: the model has vertices 0 to {self.model.vertex_count - 1}."
+            )
+        if self.speaker_weights is not None and self.speaker_weights.shape != (self.model.speaker.size,):
+            raise InputError(
+                f"{self.speaker_weights.size} speaker weights were given, but the model '{self.model.name}' has "
+                f"{self.model.speaker.size}."
             )
 
     @cached_property
@@ -95,8 +102,9 @@ class Scene:
 
     @cached_property
     def extent(self) -> FloatArray:
-        """(2, 3) mm, lowest and highest corner: where the mean speaker's tongue can be, and the palate."""
-        speaker = self.model.for_speaker(self.model.speaker.mean)
+        """(2, 3) mm, lowest and highest corner: where the speaker's tongue can be, and the palate."""
+        weights = self.model.speaker.mean if self.speaker_weights is None else self.speaker_weights
+        speaker = self.model.for_speaker(weights)
         shapes = [speaker.vertices(speaker.mean)]
         for direction, sigma in enumerate(speaker.sigma):
             for side in (-2.0, 2.0):
@@ -130,12 +138,13 @@ class Moment:
 def scene_of(
     model: TongueModel, session: Session, roles: Sequence[str], correspondences: Sequence[int], title: str
 ) -> Scene:
-    """The scene of a session. Raises InputError where a vertex is none of the model's."""
+    """The scene of a session. Raises InputError where a vertex or the speaker is none of the model's."""
     palate = None
     if session.palate is not None:
         back, up = session.palate.curve
         palate = np.column_stack([np.zeros_like(back), back, up])
-    return Scene(model, midsagittal_vertices(model), tuple(roles), tuple(correspondences), palate, title)
+    contour = midsagittal_vertices(model)
+    return Scene(model, contour, tuple(roles), tuple(correspondences), palate, title, session.speaker_weights)
 
 
 def moment_of(pose: TrackedPose) -> Moment:
@@ -159,6 +168,11 @@ class Moments(Sequence[Moment]):
     def __init__(self, poses: TrackedPoses) -> None:
         self.times_s = poses.times_s
         self._poses = poses
+
+    @cached_property
+    def step_s(self) -> float:
+        """s from one frame to the next, as most of them are; 0 where there is one only."""
+        return float(np.median(np.diff(self.times_s))) if len(self) > 1 else 0.0
 
     def __len__(self) -> int:
         return self._poses.frame_count

@@ -23,6 +23,10 @@ DEGREES_PER_PIXEL = 0.4
 ZOOM_PER_STEP = 1.12
 TRAILS_S = (0.5, 2.0, 0.0)
 COLOURS = ("tissue", "palate", "uncertainty")
+TIME_PX = 5
+"""Height of the bar of time; it is grasped anywhere in the lowest `GRASPED_PX`."""
+GRASPED_PX = 18
+KEYS_IN_A_LINE = 4
 SAMPLES = 4
 SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "swrast", "gdi generic")
 """Rasterisers on which smooth edges would cost most of the pictures."""
@@ -55,7 +59,8 @@ class Window:
 
     view: how it is looked at, which the user changes with the mouse; colour_by of `view`, look and trails with keys.
     keys: what else keys do, for people, by name; pressed: called with a key that the window itself has no use for:
-    a letter, or "left", "right", "up", "down", "home", "end". Raises InputError with what is missing where it cannot be opened.
+    a letter, or "left", "right", "up", "down", "home", "end". scrubbed: called with the place, 0 to 1, to which the
+    user draws the time at the lower edge. Raises InputError with what is missing where it cannot be opened.
     """
 
     def __init__(
@@ -65,12 +70,13 @@ class Window:
         look: Look = DARK,
         keys: Mapping[str, str] | None = None,
         pressed: Callable[[str], None] = lambda key: None,
+        scrubbed: Callable[[float], None] = lambda share: None,
         size: tuple[int, int] = SIZE,
     ) -> None:
         self.scene = scene
         self.view: View = home_view(scene)
         self.keys = {**(keys or {}), **KEYS}
-        self.pressed = pressed
+        self.pressed, self.scrubbed = pressed, scrubbed
         self.help_shown = True
         self._glfw = glfw = _imported_glfw()
         self._complaints: list[str] = []
@@ -86,6 +92,7 @@ class Window:
             glfw.terminate()
             raise
         self._dragged_from: tuple[float, float] | None = None
+        self._scrubbing = self._has_time = False
         self._next_s = time.perf_counter()
         glfw.set_char_callback(self._window, lambda _, code: self.press(chr(code)))
         glfw.set_key_callback(self._window, self._on_key)
@@ -113,10 +120,20 @@ class Window:
     @property
     def help(self) -> tuple[str, ...]:
         """What keys do, as lines for the picture; none while they are hidden."""
-        return tuple(f"{key}: {words}" for key, words in self.keys.items()) if self.help_shown else ()
+        words = [f"{key}: {words}" for key, words in self.keys.items()] if self.help_shown else []
+        return tuple(
+            " | ".join(words[row : row + KEYS_IN_A_LINE]) for row in range(0, len(words), KEYS_IN_A_LINE)
+        )
 
-    def show(self, moment: Moment) -> None:
-        """Draws the moment as `view` says, with the keys below its lines. Nothing while the window is minimised."""
+    def remember(self, moment: Moment) -> None:
+        """Lets the coils' trails pass where nothing was drawn."""
+        self._renderer.remember(moment)
+
+    def show(self, moment: Moment, share: float | None = None) -> None:
+        """Draws the moment as `view` says, with the keys below its lines. Nothing while the window is minimised.
+
+        share: of the time that has passed, 0 to 1, as a bar at the lower edge; None = there is no end.
+        """
         size = self._pixels()
         if 0 in size:
             return
@@ -128,6 +145,9 @@ class Window:
             self._renderer.draw(moment, self.view, self._context.screen)
         finally:
             self.view.lines = lines
+        self._has_time = share is not None
+        if share is not None:
+            self._draw_time(share, size)
         self._glfw.swap_buffers(self._window)
 
     def wait(self) -> None:
@@ -172,6 +192,13 @@ class Window:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def _draw_time(self, share: float, size: tuple[int, int]) -> None:
+        screen, look = self._context.screen, self._look
+        passed = round(share * size[0])
+        screen.clear(*look.line, viewport=(0, 0, size[0], TIME_PX))
+        screen.clear(*look.bar, viewport=(0, 0, max(passed, 1), TIME_PX))
+        screen.clear(*look.text, viewport=(max(passed - 2, 0), 0, 4, TIME_PX + 2))
 
     def _opened(self, title: str, size: tuple[int, int]) -> moderngl.Context:
         """The window, not shown yet, and its context. Smooth edges where a graphics card draws them."""
@@ -223,11 +250,20 @@ class Window:
             self.press(names[key])
 
     def _on_button(self, _: Any, button: int, action: int, modifiers: int) -> None:
-        pressed = action == self._glfw.PRESS
-        self._dragged_from = self._glfw.get_cursor_pos(self._window) if pressed else None
+        self._dragged_from, self._scrubbing = None, False
+        if action != self._glfw.PRESS:
+            return
+        x, y = self._glfw.get_cursor_pos(self._window)
+        if self._has_time and y > self._glfw.get_window_size(self._window)[1] - GRASPED_PX:
+            self._scrubbing = True
+            self._on_move(x, y)
+        else:
+            self._dragged_from = (x, y)
 
     def _on_move(self, x: float, y: float) -> None:
-        if self._dragged_from is not None:
+        if self._scrubbing:
+            self.scrubbed(x / self._glfw.get_window_size(self._window)[0])
+        elif self._dragged_from is not None:
             from_x, from_y = self._dragged_from
             self.view.orbit(DEGREES_PER_PIXEL * (from_x - x), DEGREES_PER_PIXEL * (y - from_y))
             self._dragged_from = (x, y)
@@ -250,5 +286,7 @@ def _imported_glfw() -> Any:
     except ImportError as reason:
         if getattr(reason, "name", "") not in ("glfw", "moderngl"):
             raise InputError(NO_DISPLAY.format(reason=_plain(reason))) from reason
-        raise InputError("the window needs the extra 'viewer': pip install 'tonguetrack[viewer]'.") from reason
+        raise InputError(
+            "the window needs the extra 'viewer': pip install 'tonguetrack[viewer]'."
+        ) from reason
     return glfw
