@@ -11,6 +11,7 @@ from tonguetrack import InputError
 from tonguetrack.model.mesh import vertex_normals
 from tonguetrack.tracker.bundled import bundled_model, bundled_recording
 from tonguetrack.tracker.pose import CoilState, PoseStatus
+from tonguetrack.tracker.session import Session
 from tonguetrack.tracker.viewer import offscreen
 from tonguetrack.tracker.viewer.camera import FIELD_DEG, home_view
 from tonguetrack.tracker.viewer.look import DARK, LIGHT
@@ -186,7 +187,7 @@ def test_a_free_speaker_looks_as_the_same_speaker_fixed(drawing, model, scene):
 def test_a_model_with_other_numbers_of_weights_is_drawn_as_well(model):
     require_egl()
     fewer = model.truncated(2, 3)
-    scene = scene_of(fewer, bundled_recording()[1], (), (), BARE)
+    scene = scene_of(fewer, Session(), (), (), BARE)
     view = home_view(scene)
     moment = posed(fewer, (1.0, -1.0, 2.0))
     with Offscreen(scene, SIZE, DARK) as drawing:

@@ -64,6 +64,17 @@ def test_a_vertex_that_the_model_does_not_have_is_refused_by_its_number(model):
         scene_of(model, Session(), ("tongue_tip", "tongue_blade"), (5,), "x")
 
 
+def test_a_scene_is_as_large_as_its_own_speakers_tongue(model, scene):
+    speaker = model.speaker.mean * 3.0
+    other = dataclasses.replace(scene, speaker_weights=speaker)
+    low, high = other.extent
+    vertices = model.vertices(speaker, model.pose.raw([2.0, 0, 0, 0]))
+    assert (vertices >= low - 1e-9).all() and (vertices <= high + 1e-9).all()
+    assert not np.allclose(other.extent, dataclasses.replace(scene, speaker_weights=None).extent, atol=1.0)
+    with pytest.raises(InputError, match="2 speaker weights were given"):
+        dataclasses.replace(scene, speaker_weights=np.ones(2))
+
+
 def test_a_moment_is_a_copy_that_the_next_frame_does_not_write_over():
     pose = TrackedPose(
         np.ones(4), np.full(4, 2.0), np.full(5, 3.0), np.full(2, 0.5), 0.5, 1.0, 2, PoseStatus.HELD, 7.25,
@@ -242,9 +253,10 @@ def test_the_flat_view_has_the_front_left_equal_scales_and_room_for_every_pose(s
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_the_home_view_has_the_mean_tongue_inside_its_area(scene, model, size):
+def test_the_home_view_has_the_speakers_tongue_inside_its_area(scene, model, size):
     area = layout_of(size, DARK).solid
-    pixels = solid_projection(home_view(scene), area).pixels(model.mean_vertices())
+    vertices = model.vertices(scene.speaker_weights, model.pose.mean)
+    pixels = solid_projection(home_view(scene), area).pixels(vertices)
     assert all(area.holds(x, y) for x, y in pixels[:, :2])
     assert (np.abs(pixels[:, 2]) < 1).all()
 
