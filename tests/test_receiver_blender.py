@@ -221,6 +221,8 @@ def blender(tmp_path):
     np.savez(tmp_path / "t.npz", times_s=times, vertices=[speaker.vertices(row) for row in weights])
     command = [sys.executable, "-c", IN_BLENDER, tmp_path / "t.glb", SCRIPT, tmp_path / "t.npz"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as running:
+        bound = threading.Timer(60, running.kill)  # whatever a Blender may wait for
+        bound.start()
         yield SimpleNamespace(running=running, speaker=speaker, model=model, live=tmp_path / "t.npz.npy")
         bound.cancel()
         running.kill()
