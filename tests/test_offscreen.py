@@ -364,6 +364,13 @@ def test_remembered_moments_leave_the_same_trail_as_drawn_ones(model, scene):
         assert np.array_equal(drawing.picture(moments[-1], view), drawn)
 
 
+def test_what_is_remembered_for_trails_stays_small_however_long_a_run_is(drawing, model, scene):
+    moment = posed(model, POSES[0], on_the_tongue(model, scene, POSES[0]))
+    for frame in range(10_000):
+        drawing.renderer.remember(dataclasses.replace(moment, time_s=0.004 * frame))
+    assert len(drawing.renderer._past) <= 1001
+
+
 def test_colours_tell_the_distance_to_the_palate(model, scene):
     require_egl()
     near = dataclasses.replace(scene, palate=model.mean_vertices()[scene.contour[5:30]] + [0, 0, 1.0])
