@@ -129,6 +129,38 @@ def test_a_stalled_worker_gets_the_newest_pose_afterwards_and_the_others_are_cou
     assert worker.numbers == [0, 1000]
 
 
+def test_where_more_may_wait_a_burst_is_handed_on_whole_and_in_order():
+    worker = Listener()
+    worker.gate.clear()
+    sink = SlotSink(worker, waiting=8)
+    sink.start(info())
+    sink.send(pose(0))
+    assert worker.working.wait(PATIENCE_S)
+    for number in range(1, 9):
+        sink.send(pose(number))
+    worker.gate.set()
+    until(lambda: sink.sent == 9)
+    sink.close()
+    assert worker.numbers == list(range(9)) and sink.dropped == 0
+
+
+def test_where_more_may_wait_the_oldest_give_way_to_more_than_that():
+    worker = Listener()
+    worker.gate.clear()
+    sink = SlotSink(worker, waiting=8)
+    sink.start(info())
+    sink.send(pose(0))
+    assert worker.working.wait(PATIENCE_S)
+    for number in range(1, 101):
+        sink.send(pose(number))
+        assert len(sink._free) + len(sink._newest) <= 10
+    assert sink.dropped == 92
+    worker.gate.set()
+    until(lambda: sink.sent == 9)
+    sink.close()
+    assert worker.numbers == [0, *range(93, 101)]
+
+
 def test_a_stalled_worker_costs_no_memory_however_long_it_stalls():
     worker = Listener()
     worker.gate.clear()

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 from ..pose import TrackedPose
@@ -43,19 +44,25 @@ class SlotSink:
     pose, as long as the worker is fast enough. `dropped` counts the poses that the worker could not hand on and
     those that a newer one replaced because it did not come in time; poses that are left out for the sake of the
     rate are no loss. `failure` says why it last failed, "" = it did not, or has recovered.
-    said: called once for each new failure, in the worker's thread.
+    said: called once for each new failure, in the worker's thread. waiting: so many poses may wait at a time; 1 for what
+    is looked at, more for what is recorded, where frames that come in a burst are no reason for a loss.
     """
 
     def __init__(
-        self, worker: Worker, rate_hz: float | None = None, said: Callable[[str], None] = lambda text: None
+        self,
+        worker: Worker,
+        rate_hz: float | None = None,
+        said: Callable[[str], None] = lambda text: None,
+        waiting: int = 1,
     ) -> None:
         self._worker = worker
+        self._waiting = waiting
         self._said = said
         self._period_s = None if rate_hz is None else 1.0 / rate_hz
         self.sent = 0
         self.dropped = 0
         self.failure = ""
-        # Three poses: one is being worked on, one waits, one is being written. Each is in one deque or in one
+        # One pose is being worked on, one is being written, the others wait. Each is in one deque or in one
         # thread's hands; taking from a deque and adding to it are atomic, so that the loop needs no lock.
         self._free: deque[TrackedPose] = deque()
         self._newest: deque[TrackedPose] = deque()
@@ -86,13 +93,14 @@ class SlotSink:
             kept.take(pose)
         except IndexError:  # the first poses of a run
             kept = pose.copy()
-        try:
-            self._free.append(self._newest.popleft())
-        except IndexError:
-            pass
-        else:
-            if self._period_s is None or time.perf_counter() > self._due_s + self._period_s:
-                self.dropped += 1
+        if len(self._newest) >= self._waiting:
+            try:
+                self._free.append(self._newest.popleft())
+            except IndexError:  # the worker has just taken it
+                pass
+            else:
+                if self._period_s is None or time.perf_counter() > self._due_s + self._period_s:
+                    self.dropped += 1
         self._newest.append(kept)
         if self._period_s is None and not self._wake.is_set():
             self._wake.set()
@@ -111,13 +119,14 @@ class SlotSink:
             over = self._over
             if self._news and time.perf_counter() >= again_s:
                 info = self._news.popleft()
-                begun = self._try(lambda info=info: self._worker.begin(info))
+                begun = self._try(partial(self._worker.begin, info))
                 if not begun:
                     again_s = time.perf_counter() + AGAIN_S
                     if not self._news:
                         self._news.append(info)
             if begun:
-                self._work()
+                for _ in range(self._waiting):
+                    self._work()
             if over:
                 break
             self._rest()
@@ -129,7 +138,7 @@ class SlotSink:
             pose = self._newest.popleft()
         except IndexError:
             return
-        if self._try(lambda: self._worker.work(pose)):
+        if self._try(partial(self._worker.work, pose)):
             self.sent += 1
             self.failure = ""
         else:

@@ -21,6 +21,9 @@ AVATAR_RATE_HZ = 60.0
 LOOK_UP_RATE_HZ = 20.0
 """How often a value that somebody may ask for is renewed."""
 HIGHEST_RATE_HZ = 1000.0
+RECORDED, WAITING = ("lsl", "json"), 64
+"""At every frame, these kinds are for what keeps it: frames that come in a burst wait there, a quarter of a second at
+250 Hz, and are not lost to newer ones."""
 
 _RATE = {"rate": "poses a second at most, 0 = every frame"}
 _CALM = {**_RATE, "filter": "MINCUTOFF,BETA of a one-euro filter: Hz, and Hz for one sigma a second"}
@@ -153,7 +156,8 @@ def open_target(
     def slot(worker: Worker) -> SlotSink:
         if target.one_euro is not None:
             worker = FilteredWorker(worker, OneEuro(*target.one_euro))
-        return SlotSink(worker, target.rate_hz, said)
+        every_frame = target.rate_hz is None and target.kind.scheme in RECORDED
+        return SlotSink(worker, target.rate_hz, said, WAITING if every_frame else 1)
 
     if target.kind.scheme != "osc":
         return [slot(_worker(target, context, numbers, said))]
