@@ -192,6 +192,22 @@ def test_more_frames_than_one_piece_holds_are_written_whole(small_model, tmp_pat
         np.testing.assert_allclose(found["vertices"], expected, atol=1e-5)
 
 
+def test_a_take_of_a_live_run_is_exported_and_made_into_meshes_like_poses(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("live", "simulate:", "--seconds", "1", "--record", "take.xdf", "--osc", "127.0.0.1:9") == 0
+    assert run("take", "export", "take.xdf", "--what", "poses", "-o", "poses.npz") == 0
+    for source in ("take.xdf", "poses.npz"):
+        assert run("export", source, "-o", f"{source}.npz") == 0
+        assert run("export", source, "-o", f"{source}.glb", "--coils") == 0
+        assert run("mesh", source, "--frame", "100", "-o", f"{source}.ply") == 0
+    with np.load("take.xdf.npz") as taken, np.load("poses.npz.npz") as tracked:
+        assert len(taken["times_s"]) > 200
+        for name in ("vertices", "weights", "coils"):
+            np.testing.assert_array_equal(taken[name], tracked[name])
+    assert (tmp_path / "take.xdf.glb").read_bytes() == (tmp_path / "poses.npz.glb").read_bytes()
+    assert (tmp_path / "take.xdf.ply").read_bytes() == (tmp_path / "poses.npz.ply").read_bytes()
+
+
 # On another speaker ---------------------------------------------------------------------------------
 
 

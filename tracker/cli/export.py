@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ... import InputError
-from .names import add_speaker_flag, keep_apart, poses_and_model, prepare_folder, replayed
+from .names import add_speaker_flag, keep_apart, prepare_folder, replayed
+from .showing import poses_to_show
 
 if TYPE_CHECKING:
     from ...model.multilinear import TongueModel
@@ -34,7 +35,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     export.add_argument(
         "--every", type=int, default=1, metavar="K", help="every K-th frame (default: every frame)"
     )
-    export.add_argument("--session", metavar="FILE", help="glb: the palate of this session, as a line")
+    export.add_argument(
+        "--session", metavar="FILE", help="glb: the palate of this session, as a line; a take has its own"
+    )
     export.add_argument("--coils", action="store_true", help="glb: the coils too, as balls")
     export.add_argument("--sigmas", type=float, metavar="N",
                         help="glb: 0 and 1 are mean -+ N sigma, for a model that is also driven live (5: all that is "
@@ -50,9 +53,12 @@ def run_export(args: argparse.Namespace) -> int:
     target = Path(args.output)
     check_export_suffix(target)
     _check_flags(args, target.suffix.lower())
-    poses, model = poses_and_model(args.poses, args.model)
+    poses, model, session = poses_to_show(args.poses, args.model)
     poses, other = replayed(poses, model, args.speaker)
-    palate = other.palate if other is not None else _palate_of(args.session)
+    if other is not None:
+        palate = other.palate
+    else:
+        palate = _palate_of(args.session) if args.session else session.palate
     keep_apart([target], [Path(args.poses), Path(args.model or poses.model_path)])
     prepare_folder(target)
     frames = range(0, poses.frame_count, args.every)
@@ -82,11 +88,9 @@ def _check_flags(args: argparse.Namespace, suffix: str) -> None:
         )
 
 
-def _palate_of(session_path: str | None) -> Palate | None:
+def _palate_of(session_path: str) -> Palate:
     from ..session import load_session
 
-    if session_path is None:
-        return None
     palate = load_session(session_path).palate
     if palate is None:
         raise InputError(

@@ -20,10 +20,10 @@ from .names import (
     keep_apart,
     named_model,
     parsed_coils,
-    poses_and_model,
     prepare_folder,
     replayed,
 )
+from .showing import poses_to_show
 
 if TYPE_CHECKING:
     from ...drivers.frames import Recording
@@ -61,7 +61,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     track.set_defaults(run=run_track)
 
     mesh = commands.add_parser("mesh", help="meshes of tracked frames")
-    mesh.add_argument("poses", metavar="POSES", help="what 'track --out' wrote")
+    mesh.add_argument("poses", metavar="POSES", help="what 'track --out' wrote, or a take.xdf")
     which = mesh.add_mutually_exclusive_group(required=True)
     which.add_argument("--frame", type=int, metavar="N", help="one frame, counted from 0")
     which.add_argument(
@@ -349,7 +349,7 @@ def run_mesh(args: argparse.Namespace) -> int:
         raise InputError(
             f"{target}: meshes are written as {' or '.join(MESH_SUFFIXES)}; end the name in one of them."
         )
-    poses, model = poses_and_model(args.poses, args.model)
+    poses, model, _ = poses_to_show(args.poses, args.model)
     poses, _ = replayed(poses, model, args.speaker)
     if args.frame is not None:
         if not 0 <= args.frame < poses.frame_count:
