@@ -162,8 +162,8 @@ def test_positions_and_normals_on_the_card_are_those_of_the_model(model, normali
     surface.show(moment)
     vertices = model.vertices(speaker, moment.weights)
     parts = [
-        np.frombuffer(texture.read(), dtype="f4").reshape(-1, 4)[: model.vertex_count, :3]
-        for texture in (surface.positions, surface.normals)
+        np.frombuffer(buffer.read(), dtype="f4").reshape(-1, 4)[: model.vertex_count, :3]
+        for buffer in (surface.positions, surface.normals)
     ]
     assert np.abs(parts[0] - vertices).max() < 1e-4
     assert np.abs(parts[1] - vertex_normals(vertices, model.faces)).max() < 1e-3

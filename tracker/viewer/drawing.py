@@ -31,11 +31,10 @@ from .scene import Moment, Scene, palate_distance, vertex_uncertainty, weights_c
 from .shaders import (
     GHOST_FRAGMENT,
     GHOST_VERTEX,
-    TEXTURE_WIDTH,
     TONGUE_FRAGMENT,
     TONGUE_VERTEX,
 )
-from .surface import Surface, SurfacePrograms, tongue_vertex_array
+from .surface import Surface, SurfacePrograms
 
 if TYPE_CHECKING:
     import moderngl
@@ -60,17 +59,13 @@ class Renderer:
         self._programs = SurfacePrograms(context, scene.model)
         followed = np.concatenate([scene.outline.vertices, np.asarray(scene.correspondences, dtype=np.intp)])
         self._tongue, self._ghost = (Surface(self._programs, followed) for _ in range(2))
-        self._tongue_program, self._tongue_array = tongue_vertex_array(
-            self._programs, TONGUE_VERTEX, TONGUE_FRAGMENT
-        )
-        self._ghost_program, self._ghost_array = tongue_vertex_array(
-            self._programs, GHOST_VERTEX, GHOST_FRAGMENT
-        )
-        self._values = context.texture((TEXTURE_WIDTH, self._programs.rows), 1, dtype="f4")
-        self._values.filter = (context.NEAREST, context.NEAREST)
+        self._tongue_program = context.program(TONGUE_VERTEX, fragment_shader=TONGUE_FRAGMENT)
+        self._ghost_program = context.program(GHOST_VERTEX, fragment_shader=GHOST_FRAGMENT)
+        self._values = context.buffer(np.full(scene.model.vertex_count, -1.0, dtype="f4").tobytes())
+        self._tongue_array = self._tongue.drawn_by(self._tongue_program, self._values)
+        self._ghost_array = self._ghost.drawn_by(self._ghost_program, self._values)
         self._grain = context.texture((GRAIN_PX, GRAIN_PX), 2, grain().tobytes())
         self._drawer = MarkDrawer(context)
-        self._aside = context.simple_framebuffer((1, 1))
         self._past: deque[tuple[float, FloatArray]] = deque()
         self._coloured_by: object = None
         self._typeface: Typeface | None = None
@@ -112,7 +107,7 @@ class Renderer:
         context = self._context
         self._draw_tongue(framebuffer, view, solid, legend is not None)
         # A software rasteriser starts when the target changes: now, while the marks are put together.
-        self._aside.clear()
+        self._programs.aside.clear()
         trails = self._trails(moment, view)
         in_space = self._markings.in_space(moment, solid, tongue, trails)
         in_plane = self._markings.in_plane(moment, self._flat_projection, tongue, ghost, trails)
@@ -152,23 +147,17 @@ class Renderer:
             program["to_clip"] = tuple(solid.matrix.T.ravel())
             program["to_camera"] = tuple(camera_axes(view).T.ravel())
         self._tongue_program["by_value"] = int(by_value)
-        self._values.use(2)
-        self._grain.use(3)
+        self._grain.use(0)
         context.disable(context.BLEND | context.CULL_FACE)
         context.enable(context.DEPTH_TEST)
-        self._draw_surface(self._tongue, self._tongue_array)
+        self._tongue_array.render()
         framebuffer.depth_mask = False
         if view.ghost is not None:
             context.enable(context.BLEND | context.CULL_FACE)
             context.blend_func = context.SRC_ALPHA, context.ONE_MINUS_SRC_ALPHA
-            self._draw_surface(self._ghost, self._ghost_array)
+            self._ghost_array.render()
         context.disable(context.DEPTH_TEST | context.CULL_FACE)
         framebuffer.viewport = (0, 0, *self.size)
-
-    def _draw_surface(self, tongue: Surface, array: moderngl.VertexArray) -> None:
-        tongue.positions.use(0)
-        tongue.normals.use(1)
-        array.render()
 
     def _draw_marks(self, marks: Taken) -> None:
         assert self._typeface is not None
@@ -214,14 +203,14 @@ class Renderer:
     def _write_values(self, values_mm: FloatArray, legend: Legend) -> None:
         """values_mm: (V,), NaN = unknown."""
         shares = np.where(np.isnan(values_mm), -1.0, np.clip(values_mm / legend.most_mm, 0.0, 1.0))
-        self._values.write(self._programs.layers(shares.astype("f4")[None, :, None]).tobytes())
+        self._values.write(shares.astype("f4").tobytes())
         program = self._tongue_program
         program["near_colour"], program["far_colour"] = legend.colours
 
     def _set_constants(self) -> None:
         look = self.look
         tongue = self._tongue_program
-        tongue["positions"], tongue["normals"], tongue["values"], tongue["grain"] = 0, 1, 2, 3
+        tongue["grain"] = 0
         tongue["tissue"], tongue["inside"] = look.tissue, look.inside
         tongue["unknown"] = look.unknown
         tongue["ambient"] = look.ambient
@@ -231,15 +220,14 @@ class Renderer:
         tongue["light_colours"] = [light.colour for light in lights]
         between = ways[0] + (0.0, 0.0, 1.0)
         tongue["between"] = tuple(between / np.linalg.norm(between))
-        ghost = self._ghost_program
-        ghost["positions"], ghost["normals"], ghost["tint"] = 0, 1, look.ghost
+        self._ghost_program["tint"] = look.ghost
 
     def release(self) -> None:
         """Gives everything on the graphics card back."""
         if self._typeface is not None:
             self._typeface.release()
         things = (
-            self._drawer, self._aside, self._tongue, self._ghost, self._tongue_array, self._ghost_array,
+            self._drawer, self._tongue, self._ghost, self._tongue_array, self._ghost_array,
             self._values, self._grain, self._tongue_program,
             self._ghost_program, self._programs,
         )  # fmt: skip

@@ -8,31 +8,24 @@ from __future__ import annotations
 
 TEXTURE_WIDTH = 256
 
-WHOLE_VERTEX = """
-#version 330
-void main() {
-    vec2 corner = vec2((gl_VertexID << 1) & 2, gl_VertexID & 2);
-    gl_Position = vec4(corner * 2.0 - 1.0, 0.0, 1.0);
-}
-"""
-
-POSITIONS_FRAGMENT = """
+# Both run over the vertices alone and leave their result in a buffer; nothing is rasterised, nothing waits.
+POSITIONS_VERTEX = """
 #version 330
 uniform sampler2D shapes;      // base, then the directions
 uniform sampler2D weights;     // one row: the coefficients
 uniform int rows;
 out vec4 position;
 void main() {
-    ivec2 at = ivec2(gl_FragCoord.xy);
+    ivec2 at = ivec2(gl_VertexID % WIDTH, gl_VertexID / WIDTH);
     vec3 sum = texelFetch(shapes, at, 0).xyz;
     int count = textureSize(weights, 0).x;
     for (int k = 0; k < count; k++)
         sum += texelFetch(weights, ivec2(k, 0), 0).x * texelFetch(shapes, at + ivec2(0, (k + 1) * rows), 0).xyz;
     position = vec4(sum, 1.0);
 }
-"""
+""".replace("WIDTH", str(TEXTURE_WIDTH))
 
-NORMALS_FRAGMENT = """
+NORMALS_VERTEX = """
 #version 330
 uniform sampler2D positions;
 uniform isampler2D ring;       // pairs: the two other corners of each face at the vertex, -1 = no more
@@ -42,7 +35,7 @@ vec3 place(int vertex) {
     return texelFetch(positions, ivec2(vertex % WIDTH, vertex / WIDTH), 0).xyz;
 }
 void main() {
-    ivec2 at = ivec2(gl_FragCoord.xy);
+    ivec2 at = ivec2(gl_VertexID % WIDTH, gl_VertexID / WIDTH);
     vec3 here = texelFetch(positions, at, 0).xyz;
     vec3 sum = vec3(0.0);
     int most = textureSize(ring, 0).y / rows;
@@ -61,9 +54,6 @@ void main() {
 # has a sharp and a dull gloss. The eye is taken to be far away.
 TONGUE_VERTEX = """
 #version 330
-uniform sampler2D positions;
-uniform sampler2D normals;
-uniform sampler2D values;      // what the vertices are coloured by, 0 to 1, negative = unknown
 uniform mat4 to_clip;
 uniform mat3 to_camera;
 uniform int by_value;
@@ -75,6 +65,9 @@ uniform vec3 ambient;
 uniform vec3 light_ways[2];
 uniform vec3 light_colours[2];
 uniform vec3 between;          // half way between the first light and the eye
+in vec4 in_position;
+in vec4 in_normal;
+in float in_value;             // what the vertex is coloured by, 0 to 1, negative = unknown
 in vec2 in_skin;
 out vec3 lit;
 out vec2 shine;                // the gloss outside, the light inside
@@ -87,21 +80,17 @@ vec3 light_on(vec3 n) {
         + light_colours[1] * max((dot(n, light_ways[1]) + WRAP) / (1.0 + WRAP), 0.0);
 }
 void main() {
-    ivec2 at = ivec2(gl_VertexID % WIDTH, gl_VertexID / WIDTH);
-    gl_Position = to_clip * vec4(texelFetch(positions, at, 0).xyz, 1.0);
-    vec3 n = to_camera * texelFetch(normals, at, 0).xyz;
+    gl_Position = to_clip * in_position;
+    vec3 n = to_camera * in_normal.xyz;
     vec3 body = tissue;
-    if (by_value == 1) {
-        float value = texelFetch(values, at, 0).x;
-        body = value < 0.0 ? unknown : mix(near_colour, far_colour, value);
-    }
+    if (by_value == 1) body = in_value < 0.0 ? unknown : mix(near_colour, far_colour, in_value);
     float grazing = 1.0 - max(n.z, 0.0);
     lit = light_on(n) * (body * body + RIM * grazing * grazing * grazing);
     float slope = max(dot(n, between), 0.0);
     shine = vec2(0.46 * pow(slope, 34.0) + 0.13 * pow(slope, 9.0), light_on(-n).y);
     skin = in_skin;
 }
-""".replace("WIDTH", str(TEXTURE_WIDTH))
+"""
 
 TONGUE_FRAGMENT = """
 #version 330
@@ -120,17 +109,16 @@ void main() {
 
 GHOST_VERTEX = """
 #version 330
-uniform sampler2D positions;
-uniform sampler2D normals;
 uniform mat4 to_clip;
 uniform mat3 to_camera;
+in vec4 in_position;
+in vec4 in_normal;
 out float edge;
 void main() {
-    ivec2 at = ivec2(gl_VertexID % WIDTH, gl_VertexID / WIDTH);
-    gl_Position = to_clip * vec4(texelFetch(positions, at, 0).xyz, 1.0);
-    edge = 1.0 - abs((to_camera * texelFetch(normals, at, 0).xyz).z);
+    gl_Position = to_clip * in_position;
+    edge = 1.0 - abs((to_camera * in_normal.xyz).z);
 }
-""".replace("WIDTH", str(TEXTURE_WIDTH))
+"""
 
 GHOST_FRAGMENT = """
 #version 330

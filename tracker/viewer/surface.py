@@ -11,12 +11,7 @@ from ...model.mesh import IndexArray
 from ...model.multilinear import SpeakerModel, TongueModel
 from ..pose import FloatArray
 from .scene import Moment
-from .shaders import (
-    NORMALS_FRAGMENT,
-    POSITIONS_FRAGMENT,
-    TEXTURE_WIDTH,
-    WHOLE_VERTEX,
-)
+from .shaders import NORMALS_VERTEX, POSITIONS_VERTEX, TEXTURE_WIDTH
 
 if TYPE_CHECKING:
     import moderngl
@@ -32,8 +27,10 @@ class SurfacePrograms:
         self.context = context
         self.model = model
         self.rows = -(-model.vertex_count // TEXTURE_WIDTH)
-        self.positions = context.program(WHOLE_VERTEX, fragment_shader=POSITIONS_FRAGMENT)
-        self.normals = context.program(WHOLE_VERTEX, fragment_shader=NORMALS_FRAGMENT)
+        self.positions = context.program(POSITIONS_VERTEX, varyings=["position"])
+        self.normals = context.program(NORMALS_VERTEX, varyings=["normal"])
+        self.aside = context.simple_framebuffer((1, 1))
+        """OpenGL runs no programme while there is nothing that could be drawn into."""
         pairs = ring_pairs(model.faces, model.vertex_count)
         self.ring = context.texture(
             (TEXTURE_WIDTH, self.rows * len(pairs)), 2, self.layers(pairs, fill=-1).tobytes(), dtype="i4"
@@ -53,49 +50,50 @@ class SurfacePrograms:
         return spread.reshape(count * self.rows, TEXTURE_WIDTH, parts)
 
     def release(self) -> None:
-        for thing in (self.positions, self.normals, self.ring, self.faces, self.skin):
+        for thing in (self.aside, self.positions, self.normals, self.ring, self.faces, self.skin):
             thing.release()
 
 
 class Surface:
-    """One tongue: positions (V, 3) and normals (V, 3) in textures, made there from the weights of a moment."""
+    """One tongue: positions and normals, (V, 4) float32 in buffers, made there from the weights of a moment."""
 
     def __init__(self, programs: SurfacePrograms, followed: NDArray[np.intp]) -> None:
         """followed: vertices whose positions are wanted here as well."""
         context = programs.context
         self._followed_vertices = followed
-        size = (TEXTURE_WIDTH, programs.rows)
-        self.positions = context.texture(size, 4, dtype="f4")
-        self.normals = context.texture(size, 4, dtype="f4")
-        self._targets = [context.framebuffer([texture]) for texture in (self.positions, self.normals)]
+        self._room = TEXTURE_WIDTH * programs.rows
+        self.positions, self.normals = (context.buffer(reserve=16 * self._room) for _ in range(2))
+        self._neighbours = context.texture((TEXTURE_WIDTH, programs.rows), 4, dtype="f4")
         self._passes = [
             context.vertex_array(program, []) for program in (programs.positions, programs.normals)
         ]
         self._programs = programs
-        self._shapes: moderngl.Texture | None = None
-        self._weights: moderngl.Texture | None = None
+        model = programs.model
+        shapes = 1 + model.pose.size
+        self._shapes = context.texture((TEXTURE_WIDTH, programs.rows * shapes), 4, dtype="f4")
+        self._weights = context.texture((model.pose.size, 1), 1, dtype="f4", alignment=1)
+        for texture in (self._neighbours, self._shapes, self._weights):
+            texture.filter = (context.NEAREST, context.NEAREST)
         self._shown = np.zeros(0)
-        self.speaker = programs.model.for_speaker(programs.model.speaker.mean)
-        self._upload(self.speaker)
+        self._change_speaker(model.for_speaker(model.speaker.mean))
 
     def show(self, moment: Moment) -> None:
         """Brings the tongue into the moment's pose."""
         if not np.array_equal(moment.speaker_weights, self.speaker.speaker_weights):
-            self._upload(self._programs.model.for_speaker(moment.speaker_weights))
+            self._change_speaker(self._programs.model.for_speaker(moment.speaker_weights))
         if np.array_equal(moment.weights, self._shown):
             return
-        assert self._shapes is not None and self._weights is not None
-        context, programs = self._programs.context, self._programs
+        points = self._programs.context.POINTS
+        self._programs.aside.use()
+        positions, normals = self._passes
         self._weights.write(np.asarray(moment.weights, dtype="f4").tobytes())
-        context.disable(context.DEPTH_TEST | context.BLEND | context.CULL_FACE)
-        for target, way, textures in (
-            (self._targets[0], self._passes[0], (self._shapes, self._weights)),
-            (self._targets[1], self._passes[1], (self.positions, programs.ring)),
-        ):
-            target.use()
-            textures[0].use(0)
-            textures[1].use(1)
-            way.render(vertices=3)
+        self._shapes.use(0)
+        self._weights.use(1)
+        positions.transform(self.positions, mode=points, vertices=self._room)
+        self._neighbours.write(self.positions)
+        self._neighbours.use(0)
+        self._programs.ring.use(1)
+        normals.transform(self.normals, mode=points, vertices=self._room)
         self._shown = np.array(moment.weights)
 
     def vertices(self) -> FloatArray:
@@ -106,39 +104,36 @@ class Surface:
         """(f, 3) mm, of the followed vertices alone."""
         return self._followed_model.vertices(self._shown)
 
-    def _upload(self, speaker: SpeakerModel) -> None:
-        programs, context = self._programs, self._programs.context
-        shapes = np.concatenate([speaker.base[None], speaker.directions]).reshape(-1, speaker.vertex_count, 3)
-        values = programs.layers(np.pad(shapes, ((0, 0), (0, 0), (0, 1))).astype("f4"))
-        if self._shapes is None:
-            count = len(speaker.directions)
-            self._shapes = context.texture((TEXTURE_WIDTH, len(values)), 4, dtype="f4")
-            self._weights = context.texture((count, 1), 1, dtype="f4", alignment=1)
-            for texture in (self._shapes, self._weights, self.positions, self.normals):
-                texture.filter = (context.NEAREST, context.NEAREST)
-        self._shapes.write(values.tobytes())
+    def _change_speaker(self, speaker: SpeakerModel) -> None:
+        shapes = np.concatenate([speaker.base[None], speaker.directions])
+        corners = shapes.reshape(len(shapes), -1, 3).astype("f4")
+        self._shapes.write(self._programs.layers(np.pad(corners, ((0, 0), (0, 0), (0, 1)))).tobytes())
         self.speaker = speaker
         self._followed_model = speaker.at(self._followed_vertices.tolist())
         self._shown = np.zeros(0)
 
+    def drawn_by(self, program: moderngl.Program, values: moderngl.Buffer) -> moderngl.VertexArray:
+        """The faces for a programme that takes any of a vertex's position, normal, place in the grain, and value."""
+        parts = [
+            (buffer, kind, name)
+            for buffer, kind, name in (
+                (self.positions, "4f", "in_position"),
+                (self.normals, "4f", "in_normal"),
+                (self._programs.skin, "2f", "in_skin"),
+                (values, "1f", "in_value"),
+            )
+            if name in program
+        ]
+        faces = self._programs.faces
+        return self._programs.context.vertex_array(program, parts, index_buffer=faces, index_element_size=4)
+
     def release(self) -> None:
         for vertex_array in self._passes:
             vertex_array.release()
-        for target in self._targets:
-            target.release()
-        for texture in (self.positions, self.normals, self._shapes, self._weights):
-            if texture is not None:
-                texture.release()
-
-
-def tongue_vertex_array(
-    programs: SurfacePrograms, vertex_shader: str, fragment_shader: str
-) -> tuple[moderngl.Program, moderngl.VertexArray]:
-    """A programme that draws a surface with these shaders, and the faces it draws."""
-    context = programs.context
-    program = context.program(vertex_shader, fragment_shader=fragment_shader)
-    parts = [(programs.skin, "2f", "in_skin")] if "in_skin" in program else []
-    return program, context.vertex_array(program, parts, index_buffer=programs.faces, index_element_size=4)
+        for texture in (self._neighbours, self._shapes, self._weights):
+            texture.release()
+        for buffer in (self.positions, self.normals):
+            buffer.release()
 
 
 def unrolled(vertices: FloatArray) -> FloatArray:
