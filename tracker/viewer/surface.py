@@ -27,8 +27,8 @@ class SurfacePrograms:
         self.context = context
         self.model = model
         self.rows = -(-model.vertex_count // TEXTURE_WIDTH)
-        self.positions = context.program(POSITIONS_VERTEX, varyings=["position"])
-        self.normals = context.program(NORMALS_VERTEX, varyings=["normal"])
+        self.positions = context.program(POSITIONS_VERTEX, varyings=("position",))
+        self.normals = context.program(NORMALS_VERTEX, varyings=("normal",))
         self.aside = context.simple_framebuffer((1, 1))
         """OpenGL runs no programme while there is nothing that could be drawn into."""
         pairs = ring_pairs(model.faces, model.vertex_count)
