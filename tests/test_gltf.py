@@ -129,7 +129,7 @@ def test_a_direction_that_never_moves_and_a_clip_of_one_frame_are_files_as_well(
     np.testing.assert_allclose(found, speaker.vertices(weights[0]), atol=1e-5)
 
 
-def test_the_normals_are_right_in_the_middle_of_the_range_and_nearly_so_within_three_sigma(speaker):
+def test_the_normals_are_right_in_the_middle_of_the_range_and_nearly_so_within_one_sigma(speaker):
     nodes, _ = read_glb(glb(speaker, Rebased.of_range(speaker.mean, speaker.sigma), NAME))
     node = nodes[NAME]
 
