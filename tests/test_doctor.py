@@ -128,6 +128,14 @@ def test_the_cache_is_ready_when_it_holds_kernels_of_the_present_source(tmp_path
     os.utime(index, (1, 1))  # compiled long before the source was last changed
     assert "the first start compiles" in found_by(doctor._solver).found
     index.touch()
+    row = found_by(doctor._solver)
+    assert row.found.startswith(
+        f"compiled and kept in {tmp_path}; at its first use, too: RTC3D, joint speaker, "
+    )
+    for name in kernelcache.KERNEL_MODULES:
+        folder, module = name.split(".")[-2:]
+        (tmp_path / f"{folder}_0123").mkdir(exist_ok=True)
+        (tmp_path / f"{folder}_0123" / f"{module}.some-1.py311.nbi").touch()
     assert found_by(doctor._solver) == Finding("solver", "ok", f"compiled and kept in {tmp_path}")
 
 

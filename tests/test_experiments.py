@@ -336,6 +336,18 @@ def test_a_recording_cannot_take_the_name_of_all_together(tmp_path):
     assert short_names([tmp_path / "all.pos", tmp_path / "b.pos"]) == ["all.pos", "b.pos"]
 
 
+def test_an_anatomy_that_nobody_has_is_called_so_though_the_poses_make_up_for_it(
+    place, small_model, tmp_path, capsys
+):
+    pytest.importorskip("matplotlib")
+    weights = small_model.speaker.raw([9.0, 0.0, 0.0, 0.0, 0.0]).tolist()
+    (tmp_path / "other.toml").write_text(f"[speaker]\nweights = {weights}\n", encoding="utf-8")
+    assert run(place, tmp_path / "report", "--session", str(tmp_path / "other.toml")) == 0
+    said = capsys.readouterr().err
+    assert "lies 9 sigma from the mean, beyond the box of 5" in said and "leave [speaker] out" in said
+    assert "it is not in the model's frame" not in said
+
+
 def test_a_recording_that_is_not_in_the_models_frame_is_called_so(place, small_model, tmp_path, capsys):
     pytest.importorskip("matplotlib")
     astray = recording(small_model, "", 60, 1)

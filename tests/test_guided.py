@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from tonguetrack import InputError
-from tonguetrack.drivers import ReplaySource, open_recording, write_recording
+from tonguetrack.drivers import FrameOfReference, ReplaySource, open_recording, write_recording
 from tonguetrack.tracker import guided
-from tonguetrack.tracker.guided import PALATE, REST, SPEECH, parts_for, record_parts
+from tonguetrack.tracker.cli.guiding import check_axes
+from tonguetrack.tracker.guided import BITE_PLANE, PALATE, REST, SPEECH, parts_for, record_parts
 from tonguetrack.tracker.session import load_session
 from tonguetrack.tracker.simulation import HEAD_COILS, Simulation, simulate
 
@@ -69,6 +70,29 @@ def test_who_ends_it_keeps_what_was_recorded(sweep, tmp_path):
             ReplaySource(sweep, speed=None), parts, tmp_path / "new", lambda part: part.name == "rest", print
         )
     assert (tmp_path / "new" / "rest.npz").exists()
+
+
+def test_a_source_that_ends_too_early_is_named_with_the_part(sweep, tmp_path):
+    parts = [replace(part, seconds=7.0) for part in (REST, SPEECH, SPEECH)]
+    told = []
+    with pytest.raises(InputError, match=r"calibration, speech: .*ended before its first frame"):
+        record_parts(ReplaySource(sweep, speed=None), parts, tmp_path / "new", lambda part: True, told.append)
+    assert "7.0 of 7 s" in told[0] and "5.0 of 7 s" in told[1]
+
+
+def test_axes_that_nobody_states_are_asked_for_before_the_speaker_does_anything(sweep):
+    silent = ReplaySource(replace(sweep, frame=FrameOfReference()))
+    with pytest.raises(InputError, match='--frame "front left up"'):
+        check_axes(silent, [REST, SPEECH], None)
+    check_axes(silent, [BITE_PLANE, SPEECH], None)
+    check_axes(silent, [SPEECH], FrameOfReference("front", "left", "up"))
+    check_axes(ReplaySource(sweep), [SPEECH], None)
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(sweep, tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(InputError, match=r"this folder cannot be made .*--calibrate"):
+        record_parts(ReplaySource(sweep), [REST], tmp_path / "file" / "new", lambda part: True, print)
 
 
 def test_the_command_calibrates_and_goes_on_with_what_it_found(sweep, tmp_path):

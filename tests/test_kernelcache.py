@@ -1,6 +1,8 @@
-"""Where compiled kernels go when nothing is writable."""
+"""Where compiled kernels are, which modules have some, and where they go when nothing is writable."""
 
+import ast
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +11,7 @@ import pytest
 
 from tonguetrack.tracker import kernelcache
 
+ROOT = Path(__file__).parent.parent
 ASK = """
 import os, sys
 from pathlib import Path
@@ -16,7 +19,7 @@ package, home = Path(sys.argv[1]), Path(sys.argv[2])
 from tonguetrack.tracker import kernelcache
 os.environ.pop("NUMBA_CACHE_DIR", None)
 os.environ["XDG_CACHE_HOME"] = str(home / "cache")
-kernelcache.__file__ = str(package / "kernelcache.py")
+kernelcache._PACKAGE = package
 may = os.access
 os.access = lambda path, mode: not str(path).startswith((sys.argv[3], str(package))) and may(path, mode)
 kernelcache.ensure_a_writable_cache()
@@ -47,3 +50,34 @@ def test_a_folder_that_was_named_is_left_alone(monkeypatch):
     monkeypatch.setattr(kernelcache, "_can_be_made", lambda folder: False)
     kernelcache.ensure_a_writable_cache()
     assert os.environ["NUMBA_CACHE_DIR"] == "/named"
+
+
+def test_every_module_that_compiles_is_known():
+    compiling = set()
+    for path in (path for room in ("model", "drivers", "tracker") for path in (ROOT / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            decorators = node.decorator_list if isinstance(node, ast.FunctionDef) else []
+            if any(re.search("jit|vectorize|cfunc", ast.unparse(decorator)) for decorator in decorators):
+                compiling.add(path.relative_to(ROOT).with_suffix("").as_posix().replace("/", "."))
+    assert compiling == set(kernelcache.KERNEL_MODULES)
+
+
+COMPILE = """
+from tonguetrack.tracker import filters, kernelcache
+folder = kernelcache.cache_folder()
+print(kernelcache.compilations(), "tracker.filters" in kernelcache.modules_to_compile(folder))
+filters._weight_of_newest(2.0, 0.004)
+print(kernelcache.compilations(), "tracker.filters" in kernelcache.modules_to_compile(folder))
+"""
+
+
+def test_what_had_to_be_compiled_is_counted_and_found_by_the_next_start(tmp_path):
+    def told() -> list[str]:
+        environment = {**os.environ, kernelcache.VARIABLE: str(tmp_path)}
+        command = [sys.executable, "-c", COMPILE]
+        return subprocess.run(
+            command, capture_output=True, text=True, check=True, env=environment
+        ).stdout.splitlines()
+
+    assert told() == ["0 True", "1 False"]
+    assert told() == ["0 False", "0 False"]

@@ -273,6 +273,18 @@ def test_the_chosen_speaker_goes_into_the_session_and_nothing_else_changes(desk,
     assert after.correspondences == before.correspondences and after.energy == before.energy
 
 
+def test_a_recording_that_is_not_where_the_model_is_gets_a_warning_and_a_remedy(desk, capsys):
+    take = open_recording(desk / "take.csv")
+    astray = replace(take, positions=take.positions + [0.0, 0.0, 300.0])
+    write_recording(astray, desk / "astray.csv")
+    assert main(["anatomy", str(desk / "astray.csv"), "--session", str(desk / "lab.toml")]) == 0
+    said = capsys.readouterr().err
+    assert "the weights mean nothing; 'tonguetrack calibrate'" in said
+    assert main(["anatomy", str(desk / "take.csv"), "--session", str(desk / "lab.toml")]) == 0
+    said = capsys.readouterr().err
+    assert "warning" not in said and "to keep one of them: --save-session FILE --use WAY" in said
+
+
 def test_flags_that_do_not_belong_together_are_refused(desk, capsys):
     take = ["anatomy", str(desk / "take.csv")]
     for flags, words in (
@@ -281,6 +293,7 @@ def test_flags_that_do_not_belong_together_are_refused(desk, capsys):
         (["--save-session", str(desk / "x.toml"), "--use", "mesh"], "--mesh FILE"),
         (["--mesh", str(desk / "none.ply")], "no such mesh file"),
         (["--save-session", str(desk / "take.csv"), "--use", "mean"], "would be overwritten"),
+        (["--save-session", str(desk), "--use", "mean"], "this is a folder"),
     ):
         assert main([*take, *flags]) == 2
         assert words in capsys.readouterr().err

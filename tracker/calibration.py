@@ -15,6 +15,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from ..drivers.frames import FrameOfReference, Recording
 from ..model.midsagittal import midsagittal_vertices
 from ..model.multilinear import TongueModel
 from .coilmap import LATERAL_ROLES, CoilMap, checked_coil_map, guess_coil_map
-from .headcorrection import HeadMotion, HeadReference, ReferenceState, head_motion, rest_reference
+from .headcorrection import HeadMotion, HeadReference, HeadStatus, ReferenceState, head_motion, rest_reference
 from .occlusal import BITE_ROLES, OcclusalFrame, check_same_head, occlusal_frame
 from .palate import MODEL_FRAME, Palate, check_above_tongue, read_palate
 from .pose import FloatArray, TrackedPoses
@@ -36,6 +37,7 @@ from .sagittal import handedness as handedness_of_axes
 from .session import Alignment, Session, parse_session, session_toml
 from .setup import preparation_of
 from .smoothing import NO_SMOOTHING, Smoothing
+from .status import MISPLACED_MM
 from .tracking import track_recording
 
 HEAD_PREFIX = "head_"
@@ -54,6 +56,11 @@ INCISOR_COIL_MM = (0.0, -2.0, 4.0)  # of the coil on the gum above the upper inc
 FAR_FROM_MOUTH_MM = 40.0  # a tongue so far from where it lies in a model belongs to another bite plane
 PALATE_ALLOWED_MM = 1.0
 NEVER_MOVED_MM = 0.05
+HEAD_JUMP_MM = 20.0  # between neighbouring frames; no head does that
+TONGUE_LENGTH_MM = (6.0, 110.0)  # between the two coils that are farthest apart
+ON_THEIR_SIDE = 0.5  # cosine: coils at the ears, from right to left, against the stated left
+PALATE_ASIDE_MM = 5.0
+LEAST_WITHIN_3_SIGMA = 0.8  # share of frames; with fewer, the model is bent into something that is no tongue
 LITTLE_MOVEMENT_MM = 2.0  # standard deviation of tongue coils; speech has 4 and more
 EXPERIMENTS = (1, 2)
 # Channel names on a bite plate, lower case, separators removed.
@@ -187,6 +194,7 @@ def calibrate(
     coil_map, others = _coil_map(first, coils, told)
     axes = _axes(first, frame, told)
     told.append(f"smoothing: {_smoothing_words(smoothing)}")
+    _check_unit(first, list(coil_map.tongue))
     session = Session(coils=coil_map.roles, smoothing=smoothing, source="calibration")
     session = replace(session, head=_head_reference(first, session, sources, told))
     for recording in recordings:
@@ -217,6 +225,12 @@ def calibrate(
         palate = _palate(sources.palate, first, session, axes, base, others, coil_map, told)
         highest = check_above_tongue(palate, placed, first.source)
         told.append(f"palate: {palate}; 99 % of the tongue samples stay below {highest:+.1f} mm from it")
+        aside = float(np.median(palate.points_mm[:, 0]) - np.nanmedian(placed[:, :, 0]))
+        if abs(aside) > PALATE_ASIDE_MM:
+            told.append(
+                f"note: the palate was drawn {abs(aside):.0f} mm to the {'left' if aside > 0 else 'right'} of the tongue "
+                "coils, where it is lower than above them; it bounds the tongue too tightly"
+            )
     else:
         palate = None
         told.append("palate: no file; nothing bounds the tongue from above")
@@ -226,7 +240,9 @@ def calibrate(
     told.append(f"axes: {handedness(model, placed, roles, here, session.energy)}")
     fit = fit_alignment(model, placed, roles, here, session.energy, palate, midsagittal)
     told.extend(fit.sentences)
-    session = _whole_session(session, model, first, base, fit, palate, midsagittal, len(still))
+    more = f" and {len(recordings) - 1} more" if len(recordings) > 1 else ""
+    seen = f"{len(still)} frames of {first.source}{more}"
+    session = _whole_session(session, model, seen, base, fit, palate, midsagittal)
     session = parse_session(session_toml(session), session.source)  # what its user will have
 
     poses = tuple(_tracked(one, model, session) for one in recordings)
@@ -247,9 +263,25 @@ def calibrate(
     for which in EXPERIMENTS:
         told.append(f"experiment {which} before the fit ({base.source}; {first.source}): {before[which]}")
         told.append(f"experiment {which} with this session: {after[which]}")
+    told.extend(filter(None, [_doubt(after[2])]))
     return Calibration(
         session, tuple(told), base.rotation, base.translation_mm, here, fit, before, after, poses, heights, still, roles,
     )  # fmt: skip
+
+
+def _doubt(found: Figures) -> str:
+    """What in experiment 2 says that the session is not to be believed; empty where nothing does."""
+    if found.residual_mean_mm > MISPLACED_MM:
+        return (
+            f"warning: the coils stay {found.residual_mean_mm:.1f} mm away from the model: the axes, the unit or the "
+            "coils' roles are wrong, and the session is of no use"
+        )
+    if found.within_3_sigma < LEAST_WITHIN_3_SIGMA:
+        return (
+            f"warning: in {100 * (1.0 - found.within_3_sigma):.0f} % of the frames a weight is beyond 3 sigma: the model "
+            "is bent to reach the coils; check the axes and the coils' roles before the session is used"
+        )
+    return ""
 
 
 # Files and coils ------------------------------------------------------------------------------------
@@ -290,6 +322,26 @@ def _coil_map(
     return coil_map, elsewhere
 
 
+def _check_unit(recording: Recording, channels: Sequence[str]) -> None:
+    """Whether the tongue coils are as far apart as on a tongue."""
+    paths = [recording.positions[:, recording.coils.index(channel)] for channel in channels]
+    apart = {}
+    for one, other in combinations(range(len(channels)), 2):
+        distances = np.linalg.norm(paths[one] - paths[other], axis=1)
+        if np.isfinite(distances).any():
+            apart[one, other] = float(np.nanmedian(distances))
+    if not apart:
+        return
+    one, other = max(apart, key=lambda pair: apart[pair])
+    longest = apart[one, other]
+    if not TONGUE_LENGTH_MM[0] <= longest <= TONGUE_LENGTH_MM[1]:
+        raise InputError(
+            f"{recording.source}: the tongue coils {channels[one]} and {channels[other]} are {longest:.1f} mm apart, which "
+            f"on one tongue is between {TONGUE_LENGTH_MM[0]:.0f} and {TONGUE_LENGTH_MM[1]:.0f}; check the unit (--unit) and "
+            "the roles."
+        )
+
+
 def _axes(recording: Recording, frame: FrameOfReference | None, told: list[str]) -> FrameOfReference | None:
     """The axes of the files; None where nobody states them."""
     stated = recording.frame
@@ -323,9 +375,23 @@ def _smoothing_words(smoothing: Smoothing) -> str:
 def _still(
     recording: Recording, channels: Sequence[str], roles: Sequence[str], session: Session
 ) -> FloatArray:
-    """(frames, n, 3) of these channels, smoothed and with the head at rest, in the source's frame."""
+    """(frames, n, 3) of these channels, smoothed and with the head at rest, in the source's frame.
+
+    NaN where fewer than three references say where the head is: what is carried on there is good enough to track, but
+    not to place a speaker by. Raises InputError where that is every frame.
+    """
     preparation = preparation_of(recording.coils, channels, roles, session, recording.rate_hz)
-    return preparation.all_frames(recording.positions, recording.rate_hz, recording.quaternions)
+    still = preparation.all_frames(recording.positions, recording.rate_hz, recording.quaternions)
+    if session.head is not None:
+        known = _motion(recording, session, session.head).statuses == HeadStatus.OK
+        if not known.any():
+            raise InputError(
+                f"{recording.source}: in no frame three of the reference coils ({', '.join(session.head.roles)}) are where "
+                f"{session.head.source} has them to each other, so it is not known where the head is; leave out the "
+                "coil that failed with --coils, or take another recording."
+            )
+        still[~known] = np.nan
+    return still
 
 
 # The head -------------------------------------------------------------------------------------------
@@ -367,6 +433,12 @@ def _head_reference(
             positions = positions[(times >= start) & (times < end)]
             source = f"{start:g} to {end:g} s of {recording.source}"
     reference = rest_reference(positions, tuple(channels.values()), source)
+    if sources.rest is not None:
+        moving = {
+            role: recording.positions[:, recording.coils.index(channel)] for channel, role in channels.items()
+        }
+        at_rest = dict(zip(reference.roles, reference.positions_mm, strict=True))
+        check_same_head(moving, at_rest, recording.source, source)
     told.append(
         f"head (reference {', '.join(reference.roles)} at rest: {source}): distances between them are steady to "
         f"{reference.noise_mm:.2f} mm"
@@ -396,7 +468,7 @@ def _motion(recording: Recording, session: Session, reference: HeadReference) ->
 def _head_sentences(recording: Recording, session: Session, motion: HeadMotion) -> list[str]:
     known = np.isfinite(motion.translations).all(axis=1)
     if not known.any():
-        return [f"head: its motion is not known in any frame of {recording.source}"]
+        return []  # `_still` refuses such a recording
     assert session.head is not None
     centre = session.head.positions_mm.mean(axis=0)
     moved = motion.rotations[known] @ centre + motion.translations[known] - centre
@@ -411,6 +483,22 @@ def _head_sentences(recording: Recording, session: Session, motion: HeadMotion) 
     )
     told = [words]
     times = recording.times_s - recording.times_s[0]
+    sure = motion.statuses == HeadStatus.OK
+    if not sure.all():
+        told.append(
+            f"head of {recording.source}: in {100 * np.mean(~sure):.1f} % of the frames fewer than three references count; "
+            "these are left out of the calibration"
+        )
+    places = np.einsum("tab,kb->tka", motion.rotations, session.head.positions_mm)
+    places += motion.translations[:, None]
+    jumps = np.linalg.norm(np.diff(places, axis=0), axis=2).max(axis=1, initial=0.0)
+    jumps[~(sure[1:] & sure[:-1])] = 0.0
+    if jumps.max(initial=0.0) > HEAD_JUMP_MM:
+        worst = int(np.argmax(jumps)) + 1
+        told.append(
+            f"note: the head of {recording.source} jumps by {jumps.max():.0f} mm at {times[worst]:.2f} s, which no head does; "
+            "look whether reference coils were exchanged, or frames are missing there"
+        )
     for index, role in enumerate(session.head.roles):
         states = motion.states[:, index]
         slipped = np.flatnonzero(states == ReferenceState.SLIPPED)
@@ -469,6 +557,8 @@ def _base(
             '--frame "front left up", or give a bite plane with --bite-plane.'
         )
     rotation = directions(axes, first.source)
+    if "absent" not in (axes.x, axes.y, axes.z):
+        _check_sides(first, session, axes, rotation)
     if "upper incisors" in axes.origin:
         told.append(f"origin: {axes.origin} (the file's)")
         return _Base(rotation, np.zeros(3), INCISORS_BY_CONVENTION_SD, f"axes and origin of {first.source}")
@@ -487,6 +577,29 @@ def _base(
         "coil with the role head_upper_incisor, says more)"
     )
     return _Base(rotation, usual - rotation @ middle, AXES_ALONE_SD, f"axes of {first.source} alone")
+
+
+def _check_sides(
+    recording: Recording, session: Session, axes: FrameOfReference, rotation: FloatArray
+) -> None:
+    """Whether the head's references are where their names and the axes say (a bite plane has its own check)."""
+    places = {role: rotation @ place for role, place in _rest_places(recording, session).items()}
+    wrong = ""
+    if {"head_left", "head_right"} <= set(places):
+        across = places["head_left"] - places["head_right"]
+        middle = 0.5 * (places["head_left"] + places["head_right"])
+        if across[0] < ON_THEIR_SIDE * np.linalg.norm(across):
+            wrong = "head_left is not to the left of head_right"
+        elif "head_nose" in places and places["head_nose"][1] > middle[1]:
+            wrong = "head_nose is behind head_left and head_right"
+    middle_coils = {"head_nose", "head_upper_incisor"} <= set(places)
+    if middle_coils and places["head_nose"][2] < places["head_upper_incisor"][2]:
+        wrong = wrong or "head_nose is below head_upper_incisor"
+    if wrong:
+        raise InputError(
+            f"{recording.source}: with its axes (x {axes.x}, y {axes.y}, z {axes.z}), {wrong}; the axes are others, which "
+            "--frame can state, or two coils have each other's role."
+        )
 
 
 def _usual_middle(roles: Sequence[str]) -> FloatArray:
@@ -673,13 +786,13 @@ def _trace_in_its_unit(read: Any, told: list[str]) -> Palate:
 def _whole_session(
     session: Session,
     model: TongueModel,
-    recording: Recording,
+    seen: str,
     base: _Base,
     fit: Registration,
     palate: Palate | None,
     midsagittal: bool,
-    frames: int,
 ) -> Session:
+    """The session as it is written; seen: the frames that it was found on, in words."""
     rotation = _orthonormal(fit.rotation @ base.rotation)
     translation = fit.rotation @ base.translation_mm + fit.translation_mm
     bounded = f", below {palate.source}" if palate is not None else ""
@@ -687,12 +800,12 @@ def _whole_session(
         session,
         alignment=Alignment(
             rotation, translation, midsagittal,
-            f"{base.source}, then fitted to the model over {frames} frames of {recording.source}{bounded}",
+            f"{base.source}, then fitted to the model over {seen}{bounded}",
         ),
         palate=palate.transformed(fit.rotation, fit.translation_mm) if palate is not None else None,
         correspondences=dict(zip(fit.correspondences.roles, fit.vertices, strict=True)),
         speaker_weights=fit.speaker_weights,
-        speaker_source=f"joint estimate with the alignment over {frames} frames of {recording.source}",
+        speaker_source=f"joint estimate with the alignment over {seen}",
         model_fingerprint=model.fingerprint,
     )  # fmt: skip
 

@@ -27,16 +27,23 @@ if TYPE_CHECKING:
 PICTURES = {
     "views.png": "Tongue coils before the fit to the model (as axes, landmarks or bite plane have them) and after it, from "
     "the left side and from the front; the line is the model's mid-sagittal contour: before, of its mean speaker, after, "
-    "of this one, both in the mean pose.",
+    "of this one, both in the mean pose. The palate bounds what is tracked; the mean pose may well cross it.",
     "contours.png": "Tracked contours (experiment 2) with the coils and, where there is one, the palate, which none should "
     "cross.",
     "correspondences.png": "Where the coils sit on the mesh of this speaker in the mean pose; crosses: the middle of each "
     "coil's samples.",
-    "residuals.png": "Residuals of the tracked recordings over time, and per coil.",
+    "residuals.png": "Residuals of the tracked recordings over time, and per coil. The dotted lines are the paper's "
+    "thresholds, 1.25 mm for experiment 1 and 1.5 mm for experiment 2.",
 }
 REPORT_FILES = ("report.md", *PICTURES)
 MOST_POINTS = 1500  # of one cloud
 MOST_CONTOURS = 120
+LEAST_WIDTH_MM = 24.0  # of a view from the front
+LIMITS_MM = (1.25, 1.5)  # the paper's, of experiments 1 and 2
+LEAST_SHOWN_MM, SHOWN_PERCENT = (
+    3.0,
+    99.5,
+)  # of the residuals' axis; a few lost samples would press all others to the left
 COLOURS = ("#c23b22", "#2e7d32", "#1f5fa8", "#8e5bb5", "#b8860b", "#00838f")
 
 
@@ -111,8 +118,9 @@ def draw_views(calibration: Calibration, model: TongueModel) -> Figure:
     """Two rows (before and after the fit), two columns (from the side, from the front)."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 8.4), layout="constrained")
-    panels = figure.subplots(2, 2, sharey=True, width_ratios=(2.0, 1.0))
+    figure = Figure(figsize=(9, 8.4), layout="constrained")
+    # The same axes in both rows, so that the eye sees what the fit does.
+    panels = figure.subplots(2, 2, sharex="col", sharey=True)
     fit, alignment = calibration.registration, calibration.session.alignment
     placed = calibration.coils_mm @ calibration.base_rotation.T + calibration.base_translation_mm
     aligned = calibration.coils_mm @ alignment.rotation.T + alignment.translation_mm
@@ -137,11 +145,16 @@ def draw_views(calibration: Calibration, model: TongueModel) -> Figure:
                 panel.plot(above[:, axis], above[:, 2], color="0.45", linewidth=2.5, label="palate")
             panel.set_title(f"{name}, {side}")
             panel.set_xlabel(("x (left), mm", "y (back), mm")[axis])
-            panel.set_aspect("equal", adjustable="datalim")
+            panel.tick_params(labelbottom=True)
+            panel.set_aspect("equal")
             panel.grid(color="0.92")
         row[0].set_ylabel("z (up), mm")
-    handles, names = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=6, frameon=False, markerscale=5)
+    # Coils in one plane are a line from the front, which needs some room to its sides.
+    left, right = panels[0, 1].get_xlim()
+    room = max(0.0, LEAST_WIDTH_MM - (right - left)) / 2
+    panels[0, 1].set_xlim(left - room, right + room)
+    panels[0, 0].get_gridspec().set_width_ratios([np.ptp(panel.get_xlim()) for panel in panels[0]])
+    _legend_below(figure, panels[0, 0], columns=5)
     return figure
 
 
@@ -152,8 +165,9 @@ def draw_contours(calibration: Calibration, model: TongueModel) -> Figure:
     figure = Figure(figsize=(9, 6), layout="constrained")
     panel = figure.subplots()
     shapes = np.concatenate([contours(run[2], model) for run in calibration.poses])
-    for contour in _evenly(shapes, MOST_CONTOURS):
-        panel.plot(contour[:, 1], contour[:, 2], color="#e59866", alpha=0.35, linewidth=0.7)
+    for index, contour in enumerate(_evenly(shapes, MOST_CONTOURS)):
+        label = None if index else "tracked contour"
+        panel.plot(contour[:, 1], contour[:, 2], color="#e59866", alpha=0.35, linewidth=0.7, label=label)
     aligned = np.concatenate([run[2].coils for run in calibration.poses])
     _clouds(panel, aligned, calibration.roles, 1)
     palate = calibration.session.palate
@@ -163,7 +177,7 @@ def draw_contours(calibration: Calibration, model: TongueModel) -> Figure:
         title = _palate_title(calibration, palate)
     panel.set_title(title)
     _side_view(panel)
-    panel.legend(frameon=False, markerscale=5)
+    _legend_below(figure, panel, columns=5)
     return figure
 
 
@@ -177,32 +191,39 @@ def _palate_title(calibration: Calibration, palate: Palate) -> str:
 
 
 def draw_correspondences(calibration: Calibration, model: TongueModel) -> Figure:
-    """The mesh from the side, its mid-sagittal contour, and the coils' vertices with numbers."""
+    """The mesh from the side, and from above where coils sit beside the middle: contour, and the coils' vertices."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 7), layout="constrained")
-    panel = figure.subplots()
+    beside = not calibration.session.alignment.midsagittal
+    figure = Figure(figsize=(9, 11 if beside else 7), layout="constrained")
+    panels = figure.subplots(1 + beside, 1, squeeze=False)[:, 0]
     weights = calibration.session.speaker_weights
     assert weights is not None
     shape = model.vertices(weights, model.pose.mean)
-    panel.triplot(shape[:, 1], shape[:, 2], model.faces, color="0.85", linewidth=0.3)
     line = shape[midsagittal_vertices(model)]
-    panel.plot(line[:, 1], line[:, 2], color="black", linewidth=1)
     coils = np.concatenate([run[2].coils for run in calibration.poses])
-    for index, role in enumerate(calibration.roles):
-        vertex = calibration.session.correspondences[role]
-        colour = COLOURS[index % len(COLOURS)]
-        middle = np.nanmedian(coils[:, index], axis=0)
+    for panel, axes in zip(panels, ([1, 2], [1, 0])[: len(panels)], strict=True):
+        panel.triplot(*shape[:, axes].T, model.faces, color="0.85", linewidth=0.3)
+        panel.plot(*line[:, axes].T, color="black", linewidth=1)
+        for index, role in enumerate(calibration.roles):
+            vertex = calibration.session.correspondences[role]
+            colour = COLOURS[index % len(COLOURS)]
+            middle = np.nanmedian(coils[:, index], axis=0)[axes]
+            there = shape[vertex, axes]
+            label = f"{index + 1} {role}: vertex {vertex}"
+            panel.plot(*there, "o", color=colour, markersize=9, label=label)
+            panel.plot(*middle, "x", color=colour, markersize=8, markeredgewidth=2)
+            panel.annotate(
+                str(index + 1), tuple(there), xytext=(7, 7), textcoords="offset points", weight="bold"
+            )
         panel.plot(
-            *shape[vertex, 1:], "o", color=colour, markersize=9, label=f"{index + 1} {role}: vertex {vertex}"
+            [], [], "x", color="0.3", markersize=8, markeredgewidth=2, label="middle of a coil's samples"
         )
-        panel.plot(*middle[1:], "x", color=colour, markersize=8, markeredgewidth=2)
-        panel.annotate(
-            str(index + 1), tuple(shape[vertex, 1:]), xytext=(7, 7), textcoords="offset points", weight="bold"
-        )
-    _side_view(panel)
-    panel.set_title("correspondences on this speaker's mesh, mean pose")
-    panel.legend(frameon=False)
+        _side_view(panel)
+    if beside:
+        panels[1].set_ylabel("x (left), mm")
+    panels[0].set_title("correspondences on this speaker's mesh, mean pose")
+    _legend_below(figure, panels[0], columns=2)
     return figure
 
 
@@ -221,27 +242,47 @@ def draw_residuals(calibration: Calibration) -> Figure:
             label = f"experiment {which}" if begin == 0.0 else None
             over_time.plot(times, shown, color=colour, linewidth=0.7, label=label)
         begin += len(run[1].times_s) / run[1].rate_hz
-    for limit in (1.25, 1.5):
+        if run is not calibration.poses[-1]:
+            over_time.axvline(begin, color="0.3", linewidth=0.8)
+    for limit in LIMITS_MM:
         over_time.axhline(limit, color="0.5", linewidth=0.8, linestyle=":")
-    over_time.set_xlabel("time, s")
+    several = ", recordings one after the other" if len(calibration.poses) > 1 else ""
+    over_time.set_xlabel(f"time, s{several}")
     over_time.set_ylabel("mean residual of the coils, mm")
+    over_time.set_xlim(0, begin)
     over_time.set_ylim(bottom=0)
-    over_time.legend(frameon=False, loc="upper right")
+    over_time.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+    shown_mm = LEAST_SHOWN_MM
     for panel, which in zip(by_coil, EXPERIMENTS, strict=True):
         each = np.concatenate([run[which].residuals_mm[run[which].tracked] for run in calibration.poses])
+        shown_mm = max(shown_mm, float(np.nanpercentile(each, SHOWN_PERCENT)))
         for index, role in enumerate(calibration.roles):
             sorted_mm = np.sort(each[np.isfinite(each[:, index]), index])
             share = 100.0 * np.arange(1, len(sorted_mm) + 1) / max(len(sorted_mm), 1)
-            panel.plot(sorted_mm, share, color=COLOURS[index % len(COLOURS)], label=role)
-        for limit in (1.25, 1.5):
+            panel.plot(
+                [0.0, *sorted_mm, 1e6], [0.0, *share, 100.0], color=COLOURS[index % len(COLOURS)], label=role
+            )
+        for limit in LIMITS_MM:
             panel.axvline(limit, color="0.5", linewidth=0.8, linestyle=":")
         panel.set_title(f"experiment {which}")
         panel.set_xlabel("residual of the coil, mm")
         panel.set_ylabel("samples below, %")
-        panel.set_xlim(0, 5)
         panel.set_ylim(0, 100)
         panel.legend(frameon=False, loc="lower right")
+    for panel in by_coil:
+        panel.set_xlim(0, shown_mm)
     return figure
+
+
+def _legend_below(figure: Figure, panel: Axes, columns: int) -> None:
+    """The panel's legend under the figure, where it covers nothing."""
+    from matplotlib.lines import Line2D
+
+    handles, names = panel.get_legend_handles_labels()
+    legend = figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False)
+    for handle in legend.legend_handles:
+        if isinstance(handle, Line2D) and handle.get_marker() == ".":
+            handle.set_markersize(12)
 
 
 def _clouds(panel: Axes, coils: FloatArray, roles: Sequence[str], axis: int) -> None:

@@ -169,6 +169,7 @@ def draw_phones(evaluation: Evaluation) -> Figure:
                 label=name,
             )
         panel.set_title(title)
+        panel.set_xlabel("phone")
         panel.grid(axis="y", color="0.9")
     for panel in panels[:: _columns(evaluation)]:
         panel.set_ylabel("mean distance to the truth, mm")

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
 from .. import __version__
 from ..model.multilinear import TongueModel
 from .experiments import Anatomy, Experiments, Spread, Statistics, pooled, statistics_of
@@ -54,14 +56,23 @@ def describe_anatomy(anatomy: Anatomy, model: TongueModel) -> str:
     return f"{anatomy.source}; in sigma {shown}{noise}"
 
 
-def misplaced(statistics: dict[str, Pair]) -> list[str]:
-    """A warning for each recording whose residuals say that it is not where the model is."""
-    return [
+def warnings(experiments: Experiments, statistics: dict[str, Pair]) -> list[str]:
+    """What makes the numbers worthless: a recording that is not where the model is, an anatomy that nobody has."""
+    told = [
         f"warning: {name} is on average {first.error_mm.mean:.1f} mm off even with anatomy and pose free: it is not in "
-        "the model's frame (see [alignment] in docs/session.md), and its weights mean nothing"
+        "the model's frame, and its weights mean nothing; 'tonguetrack calibrate' finds its place (see [alignment] in "
+        "docs/session.md)"
         for name, (first, _) in statistics.items()
         if first.error_mm.mean > MISPLACED_MM and name != ALL
     ]
+    box = experiments.session.energy.box
+    farthest = float(np.abs(experiments.model.speaker.normalised(experiments.anatomy.weights)).max())
+    if farthest > box + 1e-6:
+        told.append(
+            f"warning: the anatomy of experiment 2 lies {farthest:.3g} sigma from the mean, beyond the box of {box:g}: it "
+            "is nobody's, however small the errors at the coils; leave [speaker] out of the session, and it is estimated"
+        )
+    return told
 
 
 # Tables for people ----------------------------------------------------------------------------------
@@ -128,7 +139,7 @@ def report_page(experiments: Experiments, statistics: dict[str, Pair], features:
         _WHAT.format(version=__version__),
         _set_up(experiments),
         NO_FILMS,
-        *misplaced(statistics),
+        *warnings(experiments, statistics),
         *_error_section(experiments, statistics),
         *_weight_section(experiments, statistics),
     ]
@@ -196,7 +207,7 @@ def _weight_section(experiments: Experiments, statistics: dict[str, Pair]) -> li
     pooled_pair = list(statistics.values())[-1]
     tables = [
         _markdown_table(
-            [f"experiment {number}", "mean", "standard deviation", "minimum", "maximum"],
+            [f"experiment {number}, sigma", "mean", "standard deviation", "minimum", "maximum"],
             _weight_rows(figures.weights),
         )
         for number, figures in enumerate(pooled_pair, 1)

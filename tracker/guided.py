@@ -71,15 +71,26 @@ def record_parts(
     """
     files = {part.name: folder / f"{part.name}.npz" for part in parts}
     check_new_folder(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: this folder cannot be made ({error.strerror}); name another with --calibrate."
+        ) from error
     for part in parts:
         if not ask(part):
             raise InputError("the calibration was ended before its last part.")
         if isinstance(source, DeviceSource):
             source.catch_up()
-        recording = gather(source, part.seconds, told)
+        try:
+            recording = gather(source, part.seconds, told)
+        except InputError as reason:
+            raise InputError(f"calibration, {part.name.replace('_', ' ')}: {reason}") from reason
         write_recording(named(recording, part), files[part.name])
-        told(f"{part.name}: {recording.frame_count} frames in {files[part.name]}")
+        told(
+            f"{part.name}: {recording.frame_count} frames, {recording.duration_s:.1f} of {part.seconds:g} s, in "
+            f"{files[part.name]}"
+        )
     return files
 
 

@@ -10,6 +10,18 @@ import tempfile
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
+KERNEL_MODULES = {
+    "drivers.devices.rtc3d_decode": "RTC3D",
+    "tracker.alignmentterms": "calibration",
+    "tracker.anatomy": "joint speaker",
+    "tracker.filters": "live smoothing",
+    "tracker.guard": "coil guard",
+    "tracker.headcorrection": "head correction",
+    "tracker.kernels": "solver",
+    "tracker.preparation": "head correction of live frames",
+}
+"""Every module with compiled functions, and what they are for."""
+_PACKAGE = Path(__file__).parent
 _made: list[str] = []
 
 
@@ -20,8 +32,7 @@ def ensure_a_writable_cache() -> None:
     """
     if "numba" in sys.modules or os.environ.get(VARIABLE):
         return
-    package = Path(__file__).parent
-    if any(_can_be_made(folder) for folder in (package / "__pycache__", _users_cache())):
+    if any(_can_be_made(folder) for folder in (_PACKAGE / "__pycache__", _users_cache())):
         return
     folder = tempfile.mkdtemp(prefix="tonguetrack-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -38,15 +49,34 @@ def cache_folder() -> Path | None:
     """Where numba keeps what it compiles, or will, by its rules; None where it can keep nothing."""
     if named := os.environ.get(VARIABLE):
         return Path(named)
-    choices = (Path(__file__).parent / "__pycache__", _users_cache())
+    choices = (_PACKAGE / "__pycache__", _users_cache())
     return next((folder for folder in choices if _can_be_made(folder)), None)
 
 
-def has_compiled_kernels(folder: Path) -> bool:
-    """Whether a folder of the cache holds kernels that were compiled from the present source."""
-    source_ns = Path(__file__).with_name("kernels.py").stat().st_mtime_ns
-    found = [*folder.glob("kernels.*.nbi"), *folder.glob("*/kernels.*.nbi")]
-    return any(index.stat().st_mtime_ns >= source_ns for index in found)
+def modules_to_compile(folder: Path) -> tuple[str, ...]:
+    """Those of KERNEL_MODULES of which `cache_folder()` holds nothing that was compiled from the present source."""
+    return tuple(name for name in KERNEL_MODULES if not _is_compiled(name, folder))
+
+
+def compilations() -> int:
+    """How many compiled functions this process did not find in the cache, so far."""
+    # A function may have a name in several modules.
+    modules = [sys.modules.get(f"{__package__.partition('.')[0]}.{name}") for name in KERNEL_MODULES]
+    found = {id(value): value for module in modules if module is not None for value in vars(module).values()}
+    statistics = [value.stats for value in found.values() if hasattr(value, "py_func")]
+    return sum(sum(each.cache_misses.values()) for each in statistics)
+
+
+def _is_compiled(module: str, folder: Path) -> bool:
+    source = _PACKAGE.parent.joinpath(*module.split(".")).with_suffix(".py")
+    # Beside each module where that can be written to, else all in one folder, by numba's rules.
+    beside = folder == _PACKAGE / "__pycache__"
+    places = [source.parent / "__pycache__"] if beside else folder.glob(f"{source.parent.name}_*")
+    newest_ns = max(
+        (index.stat().st_mtime_ns for place in places for index in place.glob(f"{source.stem}.*.nbi")),
+        default=0,
+    )
+    return newest_ns >= source.stat().st_mtime_ns
 
 
 def _users_cache() -> Path:

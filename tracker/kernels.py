@@ -219,6 +219,20 @@ def coil_residuals(coils, base, directions, weights, residuals):
 
 
 @njit(**OPTIONS)
+def finish_pose(weights, mean, sigma, states, normalised):
+    """Fills normalised (K,) from weights (K,); how many of states (n,) int64 are 0, the coils that counted.
+
+    Compiled, because after the pause between two frames five calls into numpy cost more than the solve.
+    """
+    for k in range(len(weights)):
+        normalised[k] = (weights[k] - mean[k]) / sigma[k]
+    counted = 0
+    for state in states:
+        counted += state == 0
+    return counted
+
+
+@njit(**OPTIONS)
 def free_residuals(coils, base, core, weights, residuals):
     """`coil_residuals` for the multilinear model; weights (m + n,) = speaker weights, then pose weights."""
     speakers, poses, _ = core.shape

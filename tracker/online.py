@@ -13,6 +13,7 @@ import numpy as np
 
 from ..drivers.frames import CoilFrame
 from ..model.multilinear import TongueModel
+from . import kernels
 from .guard import CoilGuard
 from .headcorrection import ReferenceState
 from .pose import CoilState, FloatArray, PoseStatus, TrackedPose
@@ -65,7 +66,8 @@ class Tracker:
         self._reset_s = max(RESET_S, RESET_PERIODS * self.period_s)
         self._fix_after_s = fix_after_s
         self.changes = -1
-        self._mean, self._sigma = model.pose.mean, model.pose.sigma
+        # Copies: the model's own are read-only, which is another type for the compiler.
+        self._mean, self._sigma = model.pose.mean.copy(), model.pose.sigma.copy()
         self._preparation = setup.preparation
         self._guard = CoilGuard(len(setup.vertices))
         self._distances = np.full(len(setup.vertices), np.nan)
@@ -107,6 +109,7 @@ class Tracker:
             solver.distances(missing, self._distances)
         self._guard.admit(missing, 0.0)
         self._guard.learn(self._distances, 0.0, 0.0)
+        self._finish(self.pose)
         self.restart()
 
     def restart(self) -> None:
@@ -170,16 +173,20 @@ class Tracker:
         if self._averages and status == PoseStatus.OK:
             self._average(solver.speaker_weights, step_s)
         pose.status = status
-        np.subtract(pose.weights, self._mean, out=pose.normalised)
-        np.divide(pose.normalised, self._sigma, out=pose.normalised)
-        pose.energy, pose.residual_mm = solver.result
-        pose.energy += self._constant_energy
-        pose.valid_coils = len(pose.coil_states) - int(np.count_nonzero(pose.coil_states))
+        pose.valid_coils = self._finish(pose)
+        energy, pose.residual_mm = solver.result.tolist()
+        pose.energy = energy + self._constant_energy
         pose.device_time_s = frame.device_time_s
         pose.frame_number = frame.frame_number
         pose.arrival_ns = frame.arrival_ns
         pose.solved_ns = time.perf_counter_ns()
         return pose
+
+    def _finish(self, pose: TrackedPose) -> int:
+        counted: int = kernels.finish_pose(
+            pose.weights, self._mean, self._sigma, pose.coil_states, pose.normalised
+        )
+        return counted
 
     def _watch(self, frame: CoilFrame, step_s: float) -> int:
         """Solves with the coils that can be trusted; the status."""

@@ -88,6 +88,11 @@ class Palate:
         turned = self.points_mm @ self._to_model.T
         return turned[:, 1].copy(), turned[:, 2].copy()
 
+    @property
+    def directions(self) -> FloatArray:
+        """(2, 3) backwards and upwards in this palate's axes: `curve` is along them."""
+        return self._to_model[1:]
+
     def height(self, back: FloatArray | float) -> FloatArray:
         """How far up the palate is, mm, so far back (any shape), both as in `curve`; NaN before and behind it."""
         return np.asarray(np.interp(back, *self.curve, left=np.nan, right=np.nan))
@@ -284,6 +289,11 @@ def axes_from_words(text: str) -> FrameOfReference:
         )
     frame = FrameOfReference(words[0], words[1], words[2], "stated")
     directions(frame, f"axes {text!r}")
+    if "absent" in words and {"left", "right"} & set(words):
+        raise InputError(
+            f"axes {text!r}: two-dimensional data lie in the mid-sagittal plane, so their axes grow to the front or back "
+            'and up or down, as in "back up".'
+        )
     return frame
 
 
@@ -313,8 +323,8 @@ def _palate_from_trace(
     filled = [axis for axis, grows in enumerate((frame.x, frame.y, frame.z)) if grows != "absent"]
     if len(filled) != columns:
         raise InputError(
-            f"{source}: the trace has {columns} columns, but the axes ({frame}) are {len(filled)}; state the axes of its "
-            "columns."
+            f"{source}: the trace has {columns} columns, but the axes ({frame}) are {len(filled)}; a trace "
+            f"has the recording's axes, so write it with {len(filled)} columns."
         )
     points = np.zeros((len(table), 3))
     points[:, filled] = table * UNITS_MM[unit]

@@ -10,7 +10,8 @@ about as closely as it follows the right ones. What tells a good place from a ba
 how unusual poses it takes. So this is minimised, the negative logarithm of a posterior:
 
     J(motion, vertices, s) =
-          N * mean over frames of -log Normal(motion(q_t); v(s, p_mean), noise^2 I + D(s) Sigma_p D(s)')
+          P * mean over frames of -log Normal(motion(q_t); v(s, p_mean), noise^2 I + D(s) Sigma_p D(s)')
+        + (N - P) * mean over frames of -log Normal(what of motion(q_t) - v(s, p_mean) no pose can follow; 0, noise^2 I)
         + |s - s_mean|^2 / (2 sigma_s^2)
         + |motion - guess|^2 / (2 sd^2)
         + (place of the tip coil - usual)^2 / (2 sd^2)    mm along the contour: coils can slide, and the motion with them
@@ -20,9 +21,10 @@ The poses are integrated out: D(s) = d v / d p at the coils, sigma_s and Sigma_p
 weights. (With the best pose instead, a larger speaker who moves less would win, however exact the coils.) The frames
 enter by their mean and covariance alone, which is why this is fast. What parts coils and vertices is mostly what the
 model cannot express, and that is the same in every frame: T frames say no more than N = T / (1 + (T - 1) r)
-independent ones, where r is the share of the noise that is not the device's own. The noise is estimated from the
-residuals, so coils that the model can express place themselves to a fraction of a millimetre, and those of a stranger
-stay near their bite plane. Scale is not fitted.
+independent ones, where r is the share of the noise that is not the device's own. How usual the poses are is told by
+fewer still, P, for neighbouring frames show the same pose: reckoned alike, from as many frames as their
+autocorrelation leaves. The noise is estimated from the residuals, so coils that the model can express place themselves
+to a fraction of a millimetre, and those of a stranger stay near their bite plane. Scale is not fitted.
 """
 
 from __future__ import annotations
@@ -30,22 +32,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .. import InputError
 from ..model.midsagittal import midsagittal_vertices, upper_surface_vertices
 from ..model.multilinear import Mode, TongueModel
+from .alignmentterms import FrameTerms, Term, mean_frame, motion_about, palate_bound
 from .anatomy import SpeakerEstimator
 from .coilmap import LATERAL_ROLES, TONGUE_ROLES
 from .correspondences import Correspondences, Places, complete_frames, slid_along_contour
-from .kernels import OPTIONS
 from .palate import Palate
 from .pose import FloatArray
 from .session import Energy
+from .speakers import effective_frames
 
 SHOWN_FRAMES = 120  # spread through the recording: for the palate, and for the speaker that is told
 MOST_INDEPENDENT = 1000  # frames; a recording has more only on paper
@@ -69,7 +70,7 @@ ADAPTATIONS = 4  # between two slides along the contour
 COOLING = 0.6  # by which the noise may fall between two slides: with less noise, places are harder to leave
 FULL_STEPS, TRIAL_STEPS = 60, 12  # of a descent; of one that only compares places
 UNITS = (2.0, 0.05)  # mm and radians of one step of the search
-DIFFERENCE = 1e-5
+CURVATURE_STEP = 0.02  # in units of the search: less than the kinks of the palate, more than rounding
 FAR_FROM_GUESS = 2.5  # standard deviations
 
 
@@ -264,67 +265,6 @@ def _settled(posterior: Callable[[], _Posterior]) -> tuple[_Posterior, _Found]:
     return min(settled, key=lambda one: one[0].value(one[1].unknowns, one[1].places, noise))
 
 
-class FrameTerms(NamedTuple):
-    """value: of the mean frame; slope: (m,) its derivatives in the raw speaker weights; off: (axes,) to be added to
-    coils for their deviation from what is expected; gain: (n, axes) of the pose; inverse: (axes, axes) of the
-    expected covariance; directions: (n, axes) d v / d p."""
-
-    value: float
-    slope: FloatArray
-    off: FloatArray
-    gain: FloatArray
-    inverse: FloatArray
-    directions: FloatArray
-
-
-@njit(**OPTIONS)
-def rotation_about(turn: FloatArray) -> FloatArray:
-    """(3, 3) from a rotation vector (3,), radians."""
-    angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
-    rotation = np.eye(3)
-    if angle > 0.0:
-        x, y, z = turn[0] / angle, turn[1] / angle, turn[2] / angle
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        rotation = rotation + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
-    return rotation
-
-
-@njit(**OPTIONS)
-def mean_frame(
-    core: FloatArray, origin: FloatArray, speaker: FloatArray, pose_mean: FloatArray, pose_covariance: FloatArray,
-    frames_mean: FloatArray, frames_covariance: FloatArray, rotation: FloatArray, translation: FloatArray,
-    axes: NDArray[np.int64], noise_mm: float,
-) -> FrameTerms:  # fmt: skip
-    """-log Normal of the mean frame: core (m, n, a) and origin (a,) at the coils' measured axes (a,), which are
-    indices into the coordinates (3n,) of frames_mean and frames_covariance, these before the motion."""
-    speakers, poses, size = core.shape
-    turned = np.zeros((size, frames_mean.shape[0]))
-    middle = np.zeros(size)
-    for row in range(size):
-        coil, axis = axes[row] // 3, axes[row] % 3
-        middle[row] = translation[axis]
-        for other in range(3):
-            turned[row, 3 * coil + other] = rotation[axis, other]
-            middle[row] += rotation[axis, other] * frames_mean[3 * coil + other]
-    spread = turned @ frames_covariance @ turned.T
-    directions = np.zeros((poses, size))
-    for weight in range(speakers):
-        directions += speaker[weight] * core[weight]
-    answering = pose_covariance @ directions
-    expected_middle = origin + pose_mean @ directions
-    off = middle - expected_middle
-    inverse = np.linalg.inv(directions.T @ answering + noise_mm**2 * np.eye(size))
-    pull = inverse @ off
-    value = 0.5 * (np.sum(inverse * spread) + np.sum(off * pull) - np.linalg.slogdet(inverse)[1])
-    narrower = inverse - inverse @ spread @ inverse - np.outer(pull, pull)
-    by_direction = answering @ narrower - np.outer(pose_mean, pull)
-    slope = np.zeros(speakers)
-    for weight in range(speakers):
-        slope[weight] = np.sum(core[weight] * by_direction)
-    # The most probable pose = mean + gain @ (coils - expected).
-    return FrameTerms(value, slope, -expected_middle, answering @ inverse, inverse, directions)  # type: ignore[arg-type]
-
-
 @dataclass(frozen=True)
 class _Found:
     """An end of the search. unknowns: motion, then the speaker in measured sigma; value: J there."""
@@ -371,7 +311,8 @@ class _Posterior:
         surface = upper_surface_vertices(model) if self._lateral else np.zeros(0, dtype=np.intp)
         self.candidates: NDArray[np.intp] = np.concatenate([contour, surface])
         self._model = model.at([int(vertex) for vertex in self.candidates])
-        self._contour = self._model.at(range(len(contour)))
+        along = self._model.at(range(len(contour)))
+        self._contour_arrays = np.array(along.core), np.array(along.origin)
         self._surface = self._model.at(range(len(contour), len(self.candidates)))
         self._mean = self._model.mean_vertices()
         steps = np.linalg.norm(np.diff(self._mean[: len(contour), 1:], axis=0), axis=1)
@@ -387,10 +328,15 @@ class _Posterior:
         self._sd = np.array(
             [guess.translation_sd_mm] * self._shifts + [np.radians(guess.rotation_sd_deg)] * turns
         )
+        if palate is not None:
+            back_and_up = palate.directions @ guess.rotation.T
+            places_mm = np.array(palate.curve) + (back_and_up @ guess.translation_mm)[:, None]
+            self._palate_arrays = back_and_up, places_mm
         # The axes that are measured: across the plane, projected coils say nothing.
         self._axes = np.flatnonzero(np.tile([not midsagittal, True, True], len(roles))).astype(np.int64)
         self.noise_mm = MODEL_NOISE_MM
         self._at_places: dict[Places, tuple[FloatArray, FloatArray]] = {}
+        self._poses_seen = _poses_seen(self._coils.reshape(len(self._coils), -1)[:, self._axes])
         self._summarise(_near_their_medians(self._coils))
 
     def _summarise(self, kept: NDArray[np.bool_]) -> None:
@@ -400,6 +346,7 @@ class _Posterior:
         self._middle_of_frames = flat.mean(axis=0)
         self._spread = np.cov(flat.T, bias=True) if len(flat) > 1 else np.zeros((flat.shape[1],) * 2)
         self.shown = _evenly(flat.reshape(len(flat), -1, 3), SHOWN_FRAMES)
+        self._under_palate = np.array(self.shown[::PALATE_STRIDE].reshape(-1, flat.shape[1]), order="C")
 
     # Where to begin ---------------------------------------------------------------------------------
 
@@ -443,12 +390,16 @@ class _Posterior:
 
     def _rigid(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation and translation from the guess's frame to the model's."""
-        turn = np.zeros(3)
+        motion = self._motion_and_slopes(unknowns)[0]
+        return motion[:3], motion[3]
+
+    def _motion_and_slopes(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of `motion_about`, for these unknowns."""
+        turn, shift = np.zeros(3), np.zeros(3)
         turn[: self.size - self._shifts] = unknowns[self._shifts : self.size]
-        shift = np.zeros(3)
         shift[-self._shifts :] = unknowns[: self._shifts]
-        rotation = rotation_about(turn)
-        return rotation, self._centre - rotation @ self._centre + shift
+        motion, slopes = motion_about(self._centre, shift, turn)
+        return motion, slopes
 
     def whole_motion(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3) and translation (3,) from the coils as they were given to the model's frame."""
@@ -465,10 +416,9 @@ class _Posterior:
 
     # J ----------------------------------------------------------------------------------------------
 
-    @property
-    def _independent_frames(self) -> float:
-        """N: how many independent frames those of the recording are worth."""
-        frames = min(self._frames, MOST_INDEPENDENT)
+    def _independent(self, frames: float) -> float:
+        """How many independent frames so many are worth: N for those of the recording, P for the poses seen."""
+        frames = min(frames, MOST_INDEPENDENT)
         repeated = 1.0 - min(DEVICE_NOISE_MM / self.noise_mm, 1.0) ** 2
         return frames / (1.0 + (frames - 1) * repeated)
 
@@ -479,28 +429,49 @@ class _Posterior:
     def value(self, unknowns: FloatArray, places: Places, noise_mm: float) -> float:
         """J with another noise."""
         own, self.noise_mm = self.noise_mm, noise_mm
-        value = self._value_and_slope(unknowns, places)[0]
+        value = self._value(unknowns, places)[0]
         self.noise_mm = own
         return value
 
-    def _value_and_slope(self, unknowns: FloatArray, places: Places) -> tuple[float, FloatArray, bool]:
-        """J, its derivatives in the speaker (in measured sigma) without the palate's, whether the palate has a say."""
-        bound = False
+    def _value(self, unknowns: FloatArray, places: Places) -> tuple[float, FrameTerms, Term | None]:
+        """J; of it, the frames' terms and the palate's."""
         frame = self._frame_terms(unknowns, places, self.noise_mm)
-        speaker = unknowns[self.size :]
-        value = self._independent_frames * frame.value + 0.5 * float(speaker @ speaker)
-        value += 0.5 * float(np.sum((unknowns[: self.size] / self._sd) ** 2))
+        poses, frames = self._independent(self._poses_seen), self._independent(self._frames)
+        value = poses * frame.whole.value + (frames - poses) * frame.beside.value
+        value += 0.5 * float(unknowns[self.size :] @ unknowns[self.size :])
+        away = unknowns[: self.size] / self._sd
+        value += 0.5 * float(away @ away) + self._cost_of_sliding(places)
+        if self._palate is None:
+            return value, frame, None
+        bound = self._bound(unknowns, places, frame)
+        return value + bound.value, frame, bound
+
+    def _cost_of_sliding(self, places: Places) -> float:
+        """Of places beside the middle, and of the tip's from the usual one."""
+        value = 0.0
         for index in self._middle:
             value += 0.5 * float(self._mean[places[index], 0] ** 2) / ASIDE_SD_MM**2
             if self._roles[index] == "tongue_tip":
-                slid = self._along[places[index]] - USUAL_PLACES_MM["tongue_tip"]
+                slid = float(self._along[places[index]]) - USUAL_PLACES_MM["tongue_tip"]
                 value += 0.5 * (slid / TIP_PLACE_SD_MM) ** 2
-        if self._palate is not None:
-            heights = np.sort(self._heights(unknowns, frame))
-            worst = heights[-max(1, round(WORST_SHARE * len(heights))) :]
-            bound = bool(worst[-1] > 0.0)
-            value += 0.5 * (float(np.maximum(worst, 0.0).mean()) / PALATE_SD_MM) ** 2
-        return value, self._independent_frames * frame.slope * self._speaker_sd + speaker, bound
+        return value
+
+    def _value_and_slope(self, unknowns: FloatArray, places: Places) -> tuple[float, FloatArray]:
+        """J and its derivatives (k,)."""
+        value, frame, bound = self._value(unknowns, places)
+        poses, frames = self._independent(self._poses_seen), self._independent(self._frames)
+        speaker_slope, by_motion = (
+            poses * whole + (frames - poses) * beside
+            for whole, beside in zip(frame.whole[1:], frame.beside[1:], strict=True)
+        )
+        if bound is not None:
+            speaker_slope, by_motion = speaker_slope + bound.slope, by_motion + bound.motion_slope
+        slope = np.concatenate([unknowns[: self.size] / self._sd**2, unknowns[self.size :]])
+        slope[: self._shifts] += by_motion[3, -self._shifts :]
+        turned = self._motion_and_slopes(unknowns)[1][: self.size - self._shifts]
+        slope[self._shifts : self.size] += np.tensordot(turned, by_motion)
+        slope[self.size :] += speaker_slope * self._speaker_sd
+        return value, slope
 
     def _frame_terms(self, unknowns: FloatArray, places: Places, noise_mm: float) -> FrameTerms:
         """The mean over the frames of their negative log likelihood, up to a constant."""
@@ -511,19 +482,26 @@ class _Posterior:
             )  # fmt: skip
         core, origin = self._at_places[places]
         rotation, translation = self._rigid(unknowns)
-        return mean_frame(
+        found: FrameTerms = mean_frame(
             core, origin, self.speaker(unknowns), self._pose_mean, self._pose_covariance, self._middle_of_frames,
             self._spread, rotation, translation, self._axes, noise_mm,
         )  # fmt: skip
+        return found
+
+    def _bound(self, unknowns: FloatArray, places: Places, frame: FrameTerms) -> Term:
+        """The palate's part; frame: the terms there."""
+        rotation, translation = self._rigid(unknowns)
+        found: Term = palate_bound(
+            *self._contour_arrays, self._at_places[places][0], self.speaker(unknowns), self._pose_mean,
+            self._pose_covariance, frame, self._under_palate, rotation, translation, self._axes, self.noise_mm,
+            *self._palate_arrays, max(1, round(WORST_SHARE * len(self._under_palate))), PALATE_SD_MM,
+        )  # fmt: skip
+        return found
 
     def _poses(self, unknowns: FloatArray, frame: FrameTerms) -> FloatArray:
         """(T, n) the poses of the shown frames that the coils make most probable."""
         coils = self.moved(unknowns).reshape(len(self.shown), -1)[:, self._axes]
         return np.asarray(self._pose_mean + (coils + frame.off) @ frame.gain.T)
-
-    def _heights(self, unknowns: FloatArray, frame: FrameTerms) -> FloatArray:
-        some = self._poses(unknowns, frame)[::PALATE_STRIDE]
-        return self.heights(_shapes(self._contour, self.speaker(unknowns), some), unknowns)
 
     def heights(self, contours: FloatArray, unknowns: FloatArray) -> FloatArray:
         """(T,) mm by which contours (T, c, 3) rise above the palate at the most; minus infinity without overlap."""
@@ -554,7 +532,7 @@ class _Posterior:
     def _descend(
         self, unknowns: FloatArray, places: Places, steps: int = FULL_STEPS, scaling: FloatArray | None = None
     ) -> tuple[FloatArray, float]:
-        """BFGS; the speaker's derivatives are exact unless the palate has a say, the motion's by differences.
+        """BFGS.
 
         scaling: (k, k), J is about round in scaling^-1 @ unknowns; None where that is not known yet.
         """
@@ -563,14 +541,7 @@ class _Posterior:
         scaling = np.diag(self._units) if scaling is None else scaling
 
         def value_and_slope(scaled: FloatArray) -> tuple[float, FloatArray]:
-            here = unknowns + scaling @ scaled
-            value, speaker_slope, bound = self._value_and_slope(here, places)
-            slope = np.concatenate([np.zeros(self.size), speaker_slope])
-            for index in range(len(here) if bound else self.size):
-                there = here.copy()
-                step = DIFFERENCE * self._units[index]
-                there[index] += step
-                slope[index] = (self._value_and_slope(there, places)[0] - value) / step
+            value, slope = self._value_and_slope(unknowns + scaling @ scaled, places)
             return value, scaling.T @ slope
 
         end = minimize(
@@ -666,7 +637,8 @@ class _Posterior:
         self._summarise(kept)
         # The recording's own poses count beside those of the model's training by how many they are.
         training = self._model.pose
-        own = self._independent_frames / (self._independent_frames + training.entries)
+        seen = self._independent(self._poses_seen)
+        own = seen / (seen + training.entries)
         poses = self._pose_mean + off[kept] @ frame.gain.T
         unsure = self._pose_covariance - frame.gain @ frame.directions.T @ self._pose_covariance
         mean = (1.0 - own) * training.mean + own * poses.mean(axis=0)
@@ -676,28 +648,22 @@ class _Posterior:
         )
         self._pose_mean = mean
         self._pose_covariance = (1.0 - own) * believed + own * (away.T @ away / len(away) + unsure)
+        if self._poses_seen * (len(self._axes) - training.size) <= len(self._units):
+            return  # motion and speaker follow so few poses whatever the noise is
         noises = NOISES_MM[NOISES_MM >= least_noise_mm]
-        likely = [self._frame_terms(unknowns, places, noise).value for noise in noises]
+        likely = [self._frame_terms(unknowns, places, noise).whole.value for noise in noises]
         self.noise_mm = float(noises[int(np.argmin(likely))])
 
     def _covariance(self, unknowns: FloatArray, places: Places) -> FloatArray:
         """(k, k) of the unknowns, from the curvature of J there; the vertices are held."""
-        step = 0.1
-        size = len(self._units)
-
-        def at(*moves: tuple[int, float]) -> float:
-            there = unknowns.copy()
-            for index, by in moves:
-                there[index] += by * step * self._units[index]
-            return self._value_and_slope(there, places)[0]
-
-        middle = at()
-        curvature = np.zeros((size, size))
-        for a in range(size):
-            curvature[a, a] = (at((a, 1)) - 2 * middle + at((a, -1))) / step**2
-            for b in range(a):
-                mixed = at((a, 1), (b, 1)) - at((a, 1), (b, -1)) - at((a, -1), (b, 1)) + at((a, -1), (b, -1))
-                curvature[a, b] = curvature[b, a] = mixed / (4 * step**2)
+        slopes = np.zeros((len(self._units),) * 2)
+        for index, unit in enumerate(self._units):
+            move = np.zeros(len(self._units))
+            move[index] = CURVATURE_STEP * unit
+            slopes[index] = self._value_and_slope(unknowns + move, places)[1]
+            slopes[index] -= self._value_and_slope(unknowns - move, places)[1]
+        curvature = slopes * self._units / (2.0 * CURVATURE_STEP)
+        curvature = 0.5 * (curvature + curvature.T)
         # The priors alone make every direction at least this curved; kinks of the palate must not undo that.
         values, vectors = np.linalg.eigh(curvature)
         least = float(min(1.0, np.min((self._units[: self.size] / self._sd) ** 2)))
@@ -725,6 +691,13 @@ def _shapes(model: TongueModel, speaker: FloatArray, poses: FloatArray) -> Float
     """(T, V, 3) mm: the model's vertices for one speaker (m,) in the poses (T, n)."""
     directions = np.tensordot(speaker, model.core, axes=1)
     return np.asarray((model.origin + poses @ directions).reshape(len(poses), -1, 3))
+
+
+def _poses_seen(series: FloatArray) -> float:
+    """How many independent poses coils (T, a) mm show: a movement within the device's noise is none."""
+    moving = float(np.median(series.var(axis=0)))
+    shown = max(0.0, 1.0 - DEVICE_NOISE_MM**2 / max(moving, 1e-12))
+    return 1.0 + (float(np.median(effective_frames(series))) - 1.0) * shown
 
 
 def _near_their_medians(coils: FloatArray) -> NDArray[np.bool_]:

@@ -73,12 +73,16 @@ def run_anatomy(args: argparse.Namespace) -> int:
         print(f"  {decision}", file=sys.stderr)
     comparison = compare_speakers(recording, model, setup, meshes, args.seconds)
     report = summarise(comparison, model)
+    if warning := misplaced(report):
+        print(f"  {warning}", file=sys.stderr)
     if args.json:
         print(json.dumps({"recording": recording.source, "model_fingerprint": model.fingerprint, **report}))
     else:
         print("\n".join(described(report)))
     if args.save_session:
         _save(args.save_session, setup.session, comparison.results[args.use])
+    else:
+        print("  to keep one of them: --save-session FILE --use WAY", file=sys.stderr)
     return 0
 
 
@@ -137,6 +141,20 @@ def summarise(comparison: Comparison, model: TongueModel) -> dict[str, Any]:
             for found in comparison.differences
         ],
     }
+
+
+def misplaced(report: dict[str, Any]) -> str | None:
+    """A warning where even the best of the speakers leaves the coils far from the model."""
+    from ..status import MISPLACED_MM
+
+    best = min(found["tracked_residual_mm"] for found in report["ways"].values())
+    if best <= MISPLACED_MM:
+        return None
+    return (
+        f"warning: the coils stay {best:.1f} mm away with the best of these speakers: the recording is not in the "
+        "model's frame, and the weights mean nothing; 'tonguetrack calibrate' finds its place (see [alignment] in "
+        "docs/session.md)"
+    )
 
 
 def described(report: dict[str, Any]) -> list[str]:

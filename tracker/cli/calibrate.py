@@ -10,11 +10,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ... import InputError
-from .names import BUNDLED, add_recording_flags, keep_apart, named_model, parsed_coils, prepare_folder
+from .names import (
+    BUNDLED,
+    add_recording_flags,
+    each_once,
+    keep_apart,
+    named_model,
+    parsed_coils,
+    prepare_folder,
+)
 
 if TYPE_CHECKING:
     from ...drivers.frames import Recording
     from ..smoothing import Smoothing
+
+WORKING = "fitting place, vertices and anatomy; this takes some seconds, the first time on this machine up to a minute ..."
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -74,8 +84,14 @@ def run_calibrate(args: argparse.Namespace) -> int:
         from ..calibrationreport import REPORT_FILES, require_plotting
 
         require_plotting()
-        outputs += [Path(args.report) / name for name in REPORT_FILES]
+        pages = [Path(args.report) / name for name in REPORT_FILES]
+        if target.resolve() in [path.resolve() for path in (Path(args.report), *pages)]:
+            raise InputError(
+                f"-o {target}: the report of --report {args.report} goes there; choose another name."
+            )
+        outputs += pages
     keep_apart(outputs, [Path(name) for name in read if name])
+    each_once(map(Path, args.recordings))
     for file in outputs:
         prepare_folder(file)
     coils = parsed_coils(args.coils) if args.coils else None
@@ -96,6 +112,7 @@ def run_calibrate(args: argparse.Namespace) -> int:
             f"{recording.source}: {recording.format}, {recording.frame_count} frames, {recording.rate_hz:g} Hz",
             file=sys.stderr,
         )
+    print(WORKING, file=sys.stderr)
     found = calibrate(recordings, model, sources, coils, frame, smoothing)
     for decision in found.decisions:
         print(f"  {decision}", file=sys.stderr)
@@ -106,9 +123,26 @@ def run_calibrate(args: argparse.Namespace) -> int:
 
         for file in write_report(found, model, Path(args.report)):
             print(f"  written: {file}", file=sys.stderr)
+    print(f"  {next_step(args)}", file=sys.stderr)
     if args.json:
         print(json.dumps({"model": model.name, "model_fingerprint": model.fingerprint, **found.as_dict()}))
     return 0
+
+
+def next_step(args: argparse.Namespace) -> str:
+    """What to look at, and the command that uses the session."""
+    import shlex
+
+    stated = {
+        "--model": None if args.model == BUNDLED else args.model,
+        "--rate": args.rate and f"{args.rate:g}",
+    }
+    stated |= {"--unit": args.unit, "--layout": args.layout, "--session": args.output, "--out": "poses.csv"}
+    flags = [word for flag, value in stated.items() if value is not None for word in (flag, str(value))]
+    track = shlex.join(["tonguetrack", "track", args.recordings[0], *flags])
+    if args.report:
+        return f"next: look at {Path(args.report) / 'report.md'} and its pictures; then {track}"
+    return f"next: {track} (with --report FOLDER, calibrate draws what it found)"
 
 
 def parsed_interval(text: str) -> tuple[float, float]:

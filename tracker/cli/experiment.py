@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from ... import InputError
-from .names import BUNDLED, add_recording_flags, as_text, keep_apart, named_model, prepare_folder
+from .names import (
+    BUNDLED,
+    add_recording_flags,
+    as_text,
+    each_once,
+    keep_apart,
+    named_model,
+    prepare_folder,
+)
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -61,9 +67,9 @@ def run_experiment(args: argparse.Namespace) -> int:
         describe_anatomy,
         describe_model,
         json_text,
-        misplaced,
         report_page,
         text_table,
+        warnings,
     )
     from ..experiments import run_experiments
     from ..features import check_rate, features_of, write_features
@@ -98,7 +104,7 @@ def run_experiment(args: argparse.Namespace) -> int:
     print(f"  anatomy of experiment 2: {describe_anatomy(done.anatomy, model)}", file=sys.stderr)
 
     statistics = all_statistics(done)
-    for warning in misplaced(statistics):
+    for warning in warnings(done, statistics):
         print(f"  {warning}", file=sys.stderr)
     numbers = json_text(done, statistics)
     page = report_page(done, statistics, features)
@@ -126,10 +132,8 @@ def short_names(paths: Sequence[Path]) -> list[str]:
     """
     from ..experimentreport import ALL
 
+    each_once(paths)
     resolved = [path.resolve() for path in paths]
-    for path, count in Counter(resolved).items():
-        if count > 1:
-            raise InputError(f"{path}: this recording is named twice; name every recording once.")
     names = [as_text(path.stem) for path in paths]
     depth = 1
     while len({*names, ALL}) <= len(names):

@@ -5,10 +5,15 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ... import InputError
+from .calibrate import WORKING
+
 if TYPE_CHECKING:
+    from ...drivers.frames import FrameOfReference
     from ...drivers.sources import Source
     from ...model.multilinear import TongueModel
     from ..calibration import Calibration
@@ -38,20 +43,28 @@ def guided_session(
         seen = gather(source, LOOK_S, say)
         roles = guess_coil_map(seen.coils, seen.positions, seen.source).roles
     parts = parts_for(roles.values())
-    say(f"calibration in {len(parts)} parts: {', '.join(part.name.replace('_', ' ') for part in parts)}")
+    check_axes(source, parts, frame)
+    say(f"to be recorded: {', '.join(part.name.replace('_', ' ') for part in parts)}")
     files = record_parts(source, parts, folder, ready, say)
-    found = calibrate(
-        [open_recording(files["speech"])],
-        model,
-        Sources(
-            rest=open_recording(files["rest"]) if "rest" in files else None,
-            bite_plane=open_recording(files["bite_plane"]) if "bite_plane" in files else None,
-            palate=files.get("palate"),
-        ),
-        dict(roles),
-        frame,
-        session.smoothing,
-    )
+    say(WORKING)
+    try:
+        found = calibrate(
+            [open_recording(files["speech"])],
+            model,
+            Sources(
+                rest=open_recording(files["rest"]) if "rest" in files else None,
+                bite_plane=open_recording(files["bite_plane"]) if "bite_plane" in files else None,
+                palate=files.get("palate"),
+            ),
+            dict(roles),
+            frame,
+            session.smoothing,
+        )
+    except InputError as reason:
+        raise InputError(
+            f"{reason} What was recorded is kept in {folder}; 'tonguetrack calibrate {files['speech']}' with the other "
+            "parts tries again without the speaker."
+        ) from reason
     for decision in found.decisions:
         say(f"  {decision}")
     path = folder / "session.toml"
@@ -61,9 +74,20 @@ def guided_session(
     return load_session(path)
 
 
+def check_axes(source: Source, parts: Sequence[Part], frame: FrameOfReference | None) -> None:
+    """Raises InputError where nothing is going to say how the axes lie, before the speaker has done anything."""
+    from ..guided import BITE_PLANE
+
+    known = "unknown" not in (source.frame.x, source.frame.y, source.frame.z)
+    if frame is None and not known and BITE_PLANE not in parts:
+        raise InputError(
+            f"{source.address}: it does not state how its axes lie to the head, and no coils are on a bite plate; say "
+            'where x, y and z grow, as in --frame "front left up".'
+        )
+
+
 def write_pictures(found: Calibration, model: TongueModel, folder: Path) -> None:
     """The report, where pictures can be drawn; a session without them is as good."""
-    from ... import InputError
     from ..calibrationreport import require_plotting, write_report
 
     try:

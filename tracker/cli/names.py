@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -100,8 +101,17 @@ def _found(file: Path) -> os.stat_result | None:
         return None
 
 
+def each_once(recordings: Iterable[Path]) -> None:
+    """Refuses a recording that is named twice, by whatever name: it would count twice."""
+    for path, count in Counter(path.resolve() for path in recordings).items():
+        if count > 1:
+            raise InputError(f"{path}: this recording is named twice; name every recording once.")
+
+
 def prepare_folder(file: Path) -> None:
     """Makes the folder of an output and checks that it can be written to, before the work is done."""
+    if file.is_dir():
+        raise InputError(f"{file}: this is a folder; give the name of a file to write.")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -321,7 +321,7 @@ def _print_report(report: dict[str, Any]) -> None:
         if figures["residual_mean_mm"] > MISPLACED_MM:
             print(
                 "  warning: residuals of this size mean that the recording is not in the model's frame; "
-                "see [alignment] in docs/session.md",
+                "'tonguetrack calibrate' finds its place (see [alignment] in docs/session.md)",
                 file=out,
             )
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from ..kernelcache import cache_lasts
+from ..kernelcache import cache_lasts, compilations
 from ..latency import NS_PER_MS, NS_PER_US, LogHistogram
 from ..live import FrameSource
 from ..pose import PoseStatus
@@ -26,18 +26,13 @@ LEGEND = "rate, status, residual, coils valid, frames dropped, solve p50/p99, ar
 @contextmanager
 def announced_compilation() -> Iterator[None]:
     """Says on stderr when the kernels are being compiled, and how long that took; silent when they only load."""
-    from .. import kernels
 
     def announce() -> None:
         _say(
             "preparing the solver; the first time on this machine it is compiled, which takes up to half a minute ..."
         )
 
-    def misses() -> int:
-        dispatchers = (kernels.prepare_frame, kernels.solve_fixed_speaker, kernels.solve_free_speaker)
-        return sum(sum(dispatcher.stats.cache_misses.values()) for dispatcher in dispatchers)
-
-    before, start = misses(), time.perf_counter()
+    before, start = compilations(), time.perf_counter()
     notice = threading.Timer(COMPILING_AFTER_S, announce)
     notice.daemon = True
     notice.start()
@@ -45,7 +40,7 @@ def announced_compilation() -> Iterator[None]:
         yield
     finally:
         notice.cancel()
-    if misses() > before:
+    if compilations() > before:
         lasts = (
             "the next start finds it ready."
             if cache_lasts()
