@@ -49,6 +49,8 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
                        help="1: anatomy and pose free in every frame; 2: anatomy fixed (default)")  # fmt: skip
     track.add_argument("--out", metavar="FILE", help="poses.csv, .json (as the authors' tracker writes) or .npz; "
                        "for several recordings a folder, or a name with {name} in it")  # fmt: skip
+    track.add_argument("--palate", metavar="FILE", help="put this palate into the session that is saved: a trace in the "
+                       "recording's axes, or a recording of a swept probe")  # fmt: skip
     track.add_argument("--save-session", metavar="FILE",
                        help="write the session with everything that was estimated, to be edited and used again")  # fmt: skip
     track.add_argument(
@@ -92,6 +94,10 @@ def run_track(args: argparse.Namespace) -> int:
         raise InputError(f"{flag} takes one recording; {len(jobs)} were found. Track them one by one.")
     if args.realtime and not args.osc:
         raise InputError("--realtime paces a stream; say where to with --osc HOST:PORT.")
+    if args.palate and not args.save_session:
+        raise InputError(
+            "--palate goes into the session that is saved; say where to with --save-session FILE."
+        )
     if args.osc:
         from ..streams.osc import resolve
 
@@ -104,7 +110,8 @@ def run_track(args: argparse.Namespace) -> int:
     outputs = [output for job in jobs for output in job.outputs.values()]
     if args.save_session:  # which may well replace --session
         outputs.append(Path(args.save_session))
-    keep_apart(outputs, [*(job.path for job in jobs), Path(args.model)])
+    read = [*(job.path for job in jobs), Path(args.model)]
+    keep_apart(outputs, [*read, Path(args.palate)] if args.palate else read)
     for file in outputs:
         prepare_folder(file)
 
@@ -148,6 +155,12 @@ def _track_one(
 
     recording = open_recording(job.path, rate_hz=args.rate, unit=args.unit, layout=args.layout)
     run = track_recording(recording, model, session, experiments)
+    if args.palate:
+        from ..calibration import palate_of_session
+
+        with_palate, told = palate_of_session(Path(args.palate), recording, run)
+        setup = replace(run.setup, session=with_palate, decisions=(*run.setup.decisions, *told))
+        run = replace(run, setup=setup)
     report = summarise(run, recording, model)
     _print_report(report)
     model_path = BUNDLED if args.model == BUNDLED else str(Path(args.model).resolve())
