@@ -19,7 +19,7 @@ from tonguetrack.tracker.calibrationreport import REPORT_FILES, draw_residuals, 
 from tonguetrack.tracker.cli import main
 from tonguetrack.tracker.headcorrection import head_motion
 from tonguetrack.tracker.session import Alignment, load_session
-from tonguetrack.tracker.setup import preparation_of
+from tonguetrack.tracker.setup import complete_setup, preparation_of
 from tonguetrack.tracker.simulation import HEAD_COILS, Simulation, simulate
 from tonguetrack.tracker.smoothing import PRESETS
 from tonguetrack.tracker.tracking import track_recording
@@ -227,8 +227,8 @@ def everything_at_once(seed, places):
 
 
 def test_four_coils_of_a_speaker_of_the_model_are_placed_to_0_3_mm_and_half_a_degree():
-    """One case, chosen because it holds: seed 1 ends 0.34 mm away, the noise of the references being in it too. How many
-    of the seeds hold is measured by tests/bench/placement.py."""
+    """One case, chosen because it holds. Of the seeds 0 to 9 seven do; 1 and 2 end 0.3 to 0.5 mm away and 5 ends 12 mm away,
+    with a note that it is far from its first guess. tests/bench/placement.py measures that."""
     off_mm, turned_deg = everything_at_once(3, FOUR_COILS)
     assert off_mm < 0.3
     assert turned_deg < 0.5
@@ -441,6 +441,11 @@ def test_a_rest_interval_without_reference_coils(refused):
     assert "only 1 of at least 3" in said
 
 
+def test_a_rest_interval_of_a_few_frames(refused):
+    said = refused("--rest", "0:0.02")
+    assert "--rest 0:0.02" in said and "5 frames" in said and "at least 10" in said
+
+
 def test_words_that_are_no_interval(refused):
     assert "START:END" in refused("--rest", "soon")
 
@@ -496,6 +501,24 @@ def test_frames_in_which_the_head_is_carried_on_do_not_place_the_speaker(files, 
     assert "take.npz" in left_out and "fewer than three references" in left_out
 
 
+def test_one_coil_does_not_level_the_mid_sagittal_plane(files, least_model):
+    take = open_recording(files[0] / "take.npz")
+    found = calibrate([take], least_model, coils={"tongue_tip": "tongue_tip"}, frame=FILE_FRAME)
+    assert found.guess.source == f"axes of {take.source} alone"
+    (plane,) = (one for one in found.decisions if one.startswith("mid-sagittal plane"))
+    assert "as the axes have it" in plane and "tongue_tip alone" in plane
+
+
+def test_two_dimensional_axes_have_no_handedness(files, least_model):
+    take = open_recording(files[0] / "take.npz")
+    flat = np.stack([take.positions[..., 1], take.positions[..., 2], 0 * take.positions[..., 0]], axis=2)
+    roles = {role: role for role in TONGUE}
+    flat_frame = FrameOfReference("back", "up", "absent")
+    found = calibrate([replace(take, positions=flat)], least_model, coils=roles, frame=flat_frame)
+    (axes,) = (one for one in found.decisions if one.startswith("axes (--frame)"))
+    assert "neither right- nor left-handed" in axes
+
+
 def test_two_references_that_are_exchanged_in_the_middle_are_noted(files, least_model):
     """The ears lie as mirror images, so no distance tells; that the head turns round within 4 ms does."""
     take = open_recording(files[0] / "take.npz")
@@ -510,6 +533,7 @@ def test_two_references_that_are_exchanged_in_the_middle_are_noted(files, least_
     found = calibrate([short], least_model, frame=FILE_FRAME)
     note = next(one for one in found.decisions if "jumps by" in one)
     assert note.startswith("note: ") and f"at {swap / RATE_HZ:.2f} s" in note and "exchanged" in note
+    assert note in complete_setup(short, least_model, found.session).decisions
 
 
 def test_a_palate_that_was_drawn_beside_the_middle_is_noted(calibrated, least_model, tmp_path):

@@ -26,8 +26,8 @@ def model():
 
 @pytest.fixture(scope="module")
 def simple(model):
-    """Fewer weights, for what does not depend on their number: a fit then takes a third of the time."""
-    return model.truncated(3, 3)
+    """Fewer weights, for what does not depend on their number: a fit then takes a fraction of the time."""
+    return model.truncated(2, 2)
 
 
 def coils_of(model, seed, noise_mm=0.1, frames=500):

@@ -53,6 +53,16 @@ def write(tmp_path, text):
     return tmp_path / "s.toml"
 
 
+def test_a_speaker_beyond_the_box_is_warned_of(tongue, small_model):
+    mean, sigma = small_model.speaker.mean, small_model.speaker.sigma
+    for away, warned in ((4.9, False), (40.0, True)):
+        weights = mean + np.eye(small_model.speaker.size)[1] * away * sigma
+        session = Session(speaker_weights=weights, model_fingerprint=small_model.fingerprint, source="s.toml")
+        told = [one for one in complete_setup(tongue, small_model, session).decisions if "warning" in one]
+        assert len(told) == warned
+    assert "weight 2 of the session's [speaker] is 40.0 sigma" in told[0] and "box of 5" in told[0]
+
+
 def test_everything_a_session_states_is_read(tmp_path):
     session = load_session(write(tmp_path, FULL))
     assert session.coils == {"T1": "tongue_tip", "T3": "tongue_dorsum", "nose": "head_nose"}

@@ -125,7 +125,7 @@ def mean_frame(
     gain = answering @ inverse
     return FrameTerms(
         Term(value, slopes[0], motion_slopes[0]), Term(beside, slopes[1], motion_slopes[1]), -expected_middle,
-        gain, inverse, directions,
+        gain, inverse, directions,  # type: ignore[arg-type]
     )  # fmt: skip
 
 

@@ -27,7 +27,15 @@ from ..drivers.frames import FrameOfReference, Recording
 from ..model.midsagittal import midsagittal_vertices
 from ..model.multilinear import TongueModel
 from .coilmap import LATERAL_ROLES, TONGUE_PREFIX, CoilMap, checked_coil_map, guess_coil_map
-from .headcorrection import HeadMotion, HeadReference, HeadStatus, ReferenceState, head_motion, rest_reference
+from .headcorrection import (
+    HeadMotion,
+    HeadReference,
+    HeadStatus,
+    ReferenceState,
+    head_jump,
+    head_motion,
+    rest_reference,
+)
 from .occlusal import BITE_ROLES, OcclusalFrame, check_same_head, occlusal_frame
 from .palate import MODEL_FRAME, Palate, check_above_tongue, read_palate
 from .pose import FloatArray, TrackedPoses
@@ -35,7 +43,7 @@ from .registration import USUAL_PLACES_MM, FirstGuess, Registration, fit_alignme
 from .sagittal import MidSagittalPlane, PlaneUnclear, directions, mid_sagittal_plane
 from .sagittal import handedness as handedness_of_axes
 from .session import Alignment, Session, parse_session, session_toml
-from .setup import preparation_of
+from .setup import jump_sentence, preparation_of
 from .smoothing import NO_SMOOTHING, Smoothing
 from .status import MISPLACED_MM
 from .tracking import TrackingRun, track_recording
@@ -43,6 +51,8 @@ from .tracking import TrackingRun, track_recording
 HEAD_PREFIX = "head_"
 PALATE_PROBE = "palate_probe"
 LEAST_REFERENCES = 3
+LEAST_REST_FRAMES = 10
+LEAST_COILS_OF_PLANE = 2  # in the middle; the path of one shows how it moves, not where the middle is
 MIDDLE_ROLES = (
     "jaw",
     "upper_lip",
@@ -57,7 +67,6 @@ INCISOR_COIL_MM = (0.0, -2.0, 4.0)  # of the coil on the gum above the upper inc
 FAR_FROM_MOUTH_MM = 40.0  # a tongue so far from where it lies in a model belongs to another bite plane
 PALATE_ALLOWED_MM = 1.0
 NEVER_MOVED_MM = 0.05
-HEAD_JUMP_MM = 20.0  # between neighbouring frames; no head does that
 TONGUE_LENGTH_MM = (6.0, 110.0)  # between the two coils that are farthest apart
 ON_THEIR_SIDE = 0.5  # cosine: coils at the ears, from right to left, against the stated left
 PALATE_ASIDE_MM = 5.0
@@ -342,9 +351,7 @@ def _axes(recording: Recording, frame: FrameOfReference | None, told: list[str])
     if frame is None:
         if not known:
             return None
-        told.append(
-            f"axes (the file's): {stated}, {handedness_of_axes(directions(stated, recording.source))}"
-        )
+        told.append(f"axes (the file's): {stated}, {_handedness_words(stated, recording.source)}")
         return stated
     # A stated origin stays one however the axes are named.
     axes = replace(frame, origin=stated.origin)
@@ -353,9 +360,15 @@ def _axes(recording: Recording, frame: FrameOfReference | None, told: list[str])
         against = f"; the file says {stated}, which is not used"
     told.append(
         f"axes (--frame): x {frame.x}, y {frame.y}, z {frame.z}, "
-        f"{handedness_of_axes(directions(frame, '--frame'))}{against}"
+        f"{_handedness_words(frame, '--frame')}{against}"
     )
     return axes
+
+
+def _handedness_words(frame: FrameOfReference, source: str) -> str:
+    if "absent" in (frame.x, frame.y, frame.z):
+        return "two-dimensional, so neither right- nor left-handed"
+    return handedness_of_axes(directions(frame, source))
 
 
 def _smoothing_words(smoothing: Smoothing) -> str:
@@ -425,6 +438,11 @@ def _head_reference(
             times = recording.times_s - recording.times_s[0]
             positions = positions[(times >= start) & (times < end)]
             source = f"{start:g} to {end:g} s of {recording.source}"
+            if len(positions) < LEAST_REST_FRAMES:
+                raise InputError(
+                    f"--rest {start:g}:{end:g}: these are {len(positions)} frames of {recording.source}; at least "
+                    f"{LEAST_REST_FRAMES} are needed to say where the head rests, so make the interval longer."
+                )
     reference = rest_reference(positions, tuple(channels.values()), source)
     if sources.rest is not None:
         moving = {
@@ -482,16 +500,9 @@ def _head_sentences(recording: Recording, session: Session, motion: HeadMotion) 
             f"head of {recording.source}: in {100 * np.mean(~sure):.1f} % of the frames fewer than three references count; "
             "these are left out of the calibration"
         )
-    places = np.einsum("tab,kb->tka", motion.rotations, session.head.positions_mm)
-    places += motion.translations[:, None]
-    jumps = np.linalg.norm(np.diff(places, axis=0), axis=2).max(axis=1, initial=0.0)
-    jumps[~(sure[1:] & sure[:-1])] = 0.0
-    if jumps.max(initial=0.0) > HEAD_JUMP_MM:
-        worst = int(np.argmax(jumps)) + 1
-        told.append(
-            f"note: the head of {recording.source} jumps by {jumps.max():.0f} mm at {times[worst]:.2f} s, which no head does; "
-            "look whether reference coils were exchanged, or frames are missing there"
-        )
+    jump = head_jump(motion, session.head)
+    if jump is not None:
+        told.append(jump_sentence(recording, *jump))
     for index, role in enumerate(session.head.roles):
         states = motion.states[:, index]
         slipped = np.flatnonzero(states == ReferenceState.SLIPPED)
@@ -691,6 +702,12 @@ def _levelled(recordings: Sequence[Recording], session: Session, base: _Base, to
     }
     paths = np.concatenate([_still(one, list(middle), list(middle.values()), session) for one in recordings])
     source = recordings[0].source
+    if len(middle) < LEAST_COILS_OF_PLANE:
+        told.append(
+            f"mid-sagittal plane: as the axes have it ({', '.join(middle.values()) or 'no coil'} alone in the middle says "
+            f"nothing of how the plane lies; at least {LEAST_COILS_OF_PLANE} coils do)"
+        )
+        return base
     try:
         plane: MidSagittalPlane = mid_sagittal_plane(paths, base.rotation[0], source)
     except PlaneUnclear as reason:

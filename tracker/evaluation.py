@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from .. import InputError
 from ..model.build import TrainingShapes, fill_missing_by_averaging, model_from_shapes
+from ..model.fitting import fit_shapes
 from ..model.multilinear import SurfaceMarks, TongueModel
 from .anatomy import SpeakerEstimator, estimate_speaker
 from .pose import FloatArray
@@ -141,8 +142,10 @@ def robust_joint_speaker(fold: Fold) -> FloatArray:
 
 
 def speaker_from_meshes(fold: Fold) -> FloatArray:
-    """Experiment 2 with the speaker of the best fit: what a scan of the speaker is worth. It sees the true meshes."""
-    return _with_fixed_speaker(fold, _fit_to_meshes(fold)[0])
+    """Experiment 2 with the speaker fitted to the true meshes, as `tonguetrack anatomy --mesh` does (`fit_shapes`): what
+    a scan of the speaker is worth."""
+    fit = fit_shapes(fold.model, fold.truth.reshape(len(fold.truth), -1, 3), ENERGY.box)
+    return _with_fixed_speaker(fold, fit.speaker)
 
 
 def gaussian_posterior(fold: Fold) -> FloatArray:
@@ -165,8 +168,20 @@ def swept_fit(fold: Fold) -> FloatArray:
 
 def best_fit(fold: Fold) -> FloatArray:
     """One speaker and the poses with the least squared distance to the whole true meshes, in the tracker's box."""
-    speaker, poses = _fit_to_meshes(fold)
-    return _shapes(fold.model, np.broadcast_to(speaker, (len(poses), len(speaker))), poses)
+    core, truth = _reduced(fold.model, fold.truth)
+    reduced = replace(
+        fold.model,
+        core=core,
+        origin=np.zeros(core.shape[2]),
+        faces=np.zeros((0, 3), np.int32),
+        marks=SurfaceMarks(),
+    )
+    # Three coordinates of the basis make a coil: the joint estimate then is that of the whole mesh.
+    estimator = SpeakerEstimator(reduced, DATA_ONLY, len(truth))
+    estimate = estimator.estimate(truth.reshape(len(truth), -1, 3), robust=False)
+    assert estimate is not None  # meshes are complete
+    poses = estimator.poses
+    return _shapes(fold.model, np.broadcast_to(estimate.weights, (len(poses), len(estimate.weights))), poses)
 
 
 LOWER_BRACKET = "best fit"
@@ -203,23 +218,6 @@ def _with_fixed_speaker(fold: Fold, weights: FloatArray) -> FloatArray:
     speaker = fold.model.for_speaker(weights)
     poses = _each_frame_by_itself(FixedSpeakerSolver(speaker.at(fold.vertices), ENERGY), fold.coils)
     return np.asarray(speaker.base + poses @ speaker.directions)
-
-
-def _fit_to_meshes(fold: Fold) -> tuple[FloatArray, FloatArray]:
-    """(m,) speaker and (T, n) poses of the best fit."""
-    core, truth = _reduced(fold.model, fold.truth)
-    reduced = replace(
-        fold.model,
-        core=core,
-        origin=np.zeros(core.shape[2]),
-        faces=np.zeros((0, 3), np.int32),
-        marks=SurfaceMarks(),
-    )
-    # Three coordinates of the basis make a coil: the joint estimate then is that of the whole mesh.
-    estimator = SpeakerEstimator(reduced, DATA_ONLY, len(truth))
-    estimate = estimator.estimate(truth.reshape(len(truth), -1, 3), robust=False)
-    assert estimate is not None  # meshes are complete
-    return estimate.weights, estimator.poses
 
 
 def _each_frame_by_itself(solver: FreeSpeakerSolver | FixedSpeakerSolver, coils: FloatArray) -> FloatArray:

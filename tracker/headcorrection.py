@@ -56,6 +56,7 @@ OFF_LINE_MM = 10.0
 """References that are all nearer to one line than this do not say how far the head is turned about it."""
 FASTEST_MM_S = 500.0
 """So fast a head that turns about three of its references moves the others, at most."""
+HEAD_JUMP_MM = 20.0  # between neighbouring frames; no head does that
 USUAL_RATE_HZ = 250.0
 LEAST_WEIGHT = 1e-3
 REST_PASSES = 3
@@ -209,6 +210,22 @@ def head_motion(
         motion,
     )
     return motion
+
+
+def head_jump(motion: HeadMotion, reference: HeadReference) -> tuple[int, float] | None:
+    """The largest jump of the head between neighbouring frames in which it is sure: the later frame, and mm.
+
+    None where none is more than HEAD_JUMP_MM. References that lie as mirror images, as the ears do, keep their
+    distances when they are exchanged; only that the head turns round from one frame to the next tells.
+    """
+    places = np.einsum("tab,kb->tka", motion.rotations, reference.positions_mm)
+    places += motion.translations[:, None]
+    jumps = np.linalg.norm(np.diff(places, axis=0), axis=2).max(axis=1, initial=0.0)
+    sure = motion.statuses == HeadStatus.OK
+    jumps[~(sure[1:] & sure[:-1])] = 0.0
+    if jumps.max(initial=0.0) <= HEAD_JUMP_MM:
+        return None
+    return int(np.argmax(jumps)) + 1, float(jumps.max())
 
 
 def correct(positions: FloatArray, motion: HeadMotion) -> FloatArray:

@@ -14,6 +14,7 @@ from ..drivers.frames import FrameOfReference, Recording
 from ..model.multilinear import TongueModel
 from .coilmap import CoilMap, checked_coil_map, guess_coil_map
 from .correspondences import estimate_correspondences
+from .headcorrection import head_jump, head_motion
 from .preparation import Preparation
 from .session import NO_SESSION, Session, axis_mapping
 
@@ -57,6 +58,8 @@ def complete_setup(recording: Recording, model: TongueModel, session: Session) -
     )
     decisions.extend(_frame_hints(recording, session))
     _check_speaker(model, session)
+    decisions.extend(_speaker_warnings(model, session))
+    decisions.extend(_head_warnings(recording, replace(session, coils=coil_map.roles)))
 
     stated = {role: session.correspondences[role] for role in roles if role in session.correspondences}
     _check_vertices(model, stated, session)
@@ -155,6 +158,48 @@ def _check_speaker(model: TongueModel, session: Session) -> None:
             f"'{model.name}' [{model.fingerprint}], where they mean another anatomy; name that model with --model, or "
             "remove [speaker] and [correspondences] to have them estimated again."
         )
+
+
+def _speaker_warnings(model: TongueModel, session: Session) -> list[str]:
+    """Whether the session's speaker is one whom the tracker would never find itself."""
+    if session.speaker_weights is None:
+        return []
+    away = np.abs(model.speaker.normalised(session.speaker_weights))
+    if away.max() <= session.energy.box + 1e-6:
+        return []
+    return [
+        (
+            f"warning: weight {int(away.argmax()) + 1} of the session's [speaker] is {away.max():.1f} sigma from the mean, "
+            f"outside the box of {session.energy.box:g}: no anatomy of this model is like that; estimate it again by removing "
+            "[speaker], or with tonguetrack anatomy"
+        )
+    ]
+
+
+def _head_warnings(recording: Recording, session: Session) -> list[str]:
+    """Whether the head jumps, which the distances between references alone do not tell."""
+    if session.head is None:
+        return []
+    channels = {role: channel for channel, role in session.coils.items()}
+    references = [channels.get(role, "") for role in session.head.roles]
+    if not set(references) <= set(recording.coils):
+        return []  # `preparation_of` refuses it
+    picked = picked_channels(recording.coils, references)
+    turned = None if recording.quaternions is None else recording.quaternions[:, picked]
+    motion = head_motion(recording.positions[:, picked], session.head, recording.rate_hz, turned)
+    jump = head_jump(motion, session.head)
+    if jump is None:
+        return []
+    return [jump_sentence(recording, *jump)]
+
+
+def jump_sentence(recording: Recording, frame: int, jump_mm: float) -> str:
+    """What `head_jump` found, for people."""
+    time_s = recording.times_s[frame] - recording.times_s[0]
+    return (
+        f"note: the head of {recording.source} jumps by {jump_mm:.0f} mm at {time_s:.2f} s, which no head does; look "
+        "whether reference coils were exchanged, or frames are missing there"
+    )
 
 
 def _of_another_model(session: Session, model: TongueModel) -> bool:
