@@ -21,6 +21,7 @@ from ...model.multilinear import TongueModel
 from ..bundled import bundled_model
 from ..control import Control, ControlQueue
 from ..keyboard import KeyMeanings
+from ..outside import GHOST_NAME
 from ..pose import CoilState, PoseStatus
 from ..posefiles import read_poses
 from ..session import parse_session
@@ -35,8 +36,6 @@ SILENT_S = 0.5
 """Without a new pose for longer, the window says so."""
 TOLD_S = 2.0
 """So long it says what was asked of the run."""
-GHOST_NAME = "ghost.npz"
-"""In the feed's folder: poses of a tongue to compare with, where there is one."""
 KEYS = {"space": "marker", "t": "take", "f": "fix speaker"}
 GHOST_KEYS = {"g": "ghost here"}
 
