@@ -9,6 +9,7 @@ import sys
 import time
 import wave
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -290,6 +291,24 @@ def test_a_ghost_a_colour_and_another_speaker_change_the_picture(drawn):
     assert min(ghost_px["ghost"], ghost_px["running"]) > 200
 
 
+def test_a_take_is_drawn_with_the_session_in_it(drawn, capsys):
+    command = [
+        "live",
+        "simulate:?seconds=2",
+        "--seconds",
+        "1",
+        "--record",
+        "take.xdf",
+        "--osc",
+        "127.0.0.1:9",
+    ]
+    session = Path(__file__).resolve().parents[1] / "recordings" / "demo.session.toml"
+    assert main([*command, "--session", str(session), "--control", "127.0.0.1:0"]) == 0
+    assert main(["render", "take.xdf", "-o", "a.png", "--frame", "100", *SMALL]) == 0
+    assert "take, tonguetrack synthetic tongue" in capsys.readouterr().err
+    assert unlike(np.asarray(Image.open("a.png")), np.round(255 * np.array(DARK.background))).mean() > 0.1
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -359,4 +378,4 @@ def test_the_shot_checks_itself():
     poses = made_poses()
     with pytest.raises(InputError, match="fps"):
         Shot(scene_of_poses(poses), moments_of(poses), fps=1e9)
-    assert film.numbered(film.Path("x/tongue.png"), 42).as_posix() == "x/tongue_000042.png"
+    assert film.numbered(Path("x/tongue.png"), 42).as_posix() == "x/tongue_000042.png"

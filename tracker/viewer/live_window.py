@@ -58,7 +58,8 @@ def scene_of_feed(about: FeedAbout) -> Scene:
     """Raises InputError where the feed's model or session cannot be read."""
     model = bundled_model() if about.model == "bundled" else load_model(about.model)
     session = parse_session(about.session, "the run's session")
-    return scene_of(model, session, about.roles, about.correspondences, about.title)
+    title = f"{about.title}, {model.name}"  # the model's name says where it is synthetic
+    return scene_of(model, session, about.roles, about.correspondences, title)
 
 
 def _ghost_in(folder: Path) -> Ghost | None:
