@@ -25,6 +25,8 @@ from .. import InputError
 
 WINDOW = "tonguetrack.tracker.viewer.live_window"
 PAGE = "tonguetrack.tracker.streams.page.server"
+GHOST_NAME = "ghost.npz"
+"""In the feed's folder: poses that the window compares with, where there are any."""
 PAGE_WORD = "page "
 """The line on the server's stdout that says it listens begins so; its address follows."""
 START_S = 30.0

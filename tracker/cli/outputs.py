@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .names import BUNDLED
+from .showing import add_ghost_flag
 
 if TYPE_CHECKING:
     from ..online import Tracker
@@ -31,18 +32,20 @@ def add_output_flags(parser: argparse.ArgumentParser) -> None:
                         help="stream there as well: osc://HOST:PORT, vmc://HOST, vrchat://HOST, json://HOST, lsl:NAME, "
                         "oscquery://HOST, most with ?rate=HZ and more, see docs/streams.md; may be given several times")  # fmt: skip
     parser.add_argument("--view", action="store_true", help="show the tongue in a window (extra 'viewer')")
+    add_ghost_flag(parser)
     parser.add_argument("--web", metavar="HOST:PORT", nargs="?", const=DEFAULT_PAGE,
                         help=f"show the tongue on a page for browsers (default {DEFAULT_PAGE}; extra 'web')")  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a user asked for, checked. page: HOST:PORT, "" = none."""
+    """What a user asked for, checked. page: HOST:PORT, "" = none; ghost: FILE[@SECONDS] for the window, "" = none."""
 
     osc: tuple[str, ...]
     targets: tuple[Target, ...]
     view: bool
     page: str
+    ghost: str = ""
 
     @property
     def shown(self) -> bool:
@@ -51,6 +54,7 @@ class Outputs:
 
 def outputs_of(args: argparse.Namespace) -> Outputs:
     """Raises InputError where a destination is none, its host is unknown, or the page's port is taken."""
+    from ... import InputError
     from ..streams.osc import resolve
     from ..streams.targets import parse_target
 
@@ -60,7 +64,9 @@ def outputs_of(args: argparse.Namespace) -> Outputs:
         resolve(destination)
     if args.web:
         check_page(args.web)
-    return Outputs(osc, targets, args.view, args.web or "")
+    if args.ghost and not args.view:
+        raise InputError("--ghost is shown in the window: add --view.")
+    return Outputs(osc, targets, args.view, args.web or "", args.ghost or "")
 
 
 def check_page(address: str) -> None:
@@ -123,7 +129,7 @@ def open_outputs(
     """Opens them all, to be closed by the stack. model_name: a file or "bundled"; control: where control messages are
     taken, "" = nowhere; title: for people; window_closed: called in a thread when a user closes the window.
 
-    Raises InputError where the page cannot be served; a window that cannot open is a sentence on stderr.
+    Raises InputError where the page cannot be served, or the ghost is of another model; a window that cannot open is a sentence on stderr.
     """
     from ..streams.osc import OscSink
     from ..streams.sink import StreamContext
@@ -161,9 +167,11 @@ def _show(
     window_closed: Callable[[], None],
 ) -> FeedSink:
     """The feed, and the processes that show it."""
-    from ..outside import feed_folder, start_page, start_window
+    from ..outside import GHOST_NAME, feed_folder, start_page, start_window
+    from ..posefiles import write_poses
     from ..session import session_toml
     from ..streams.feed import FeedAbout, FeedSink
+    from .showing import read_ghost
     from .watching import say_above
 
     model, setup = tracker.model, tracker.setup
@@ -193,6 +201,8 @@ def _show(
         page, url = start_page(folder, outputs.page, lambda why: say_above(f"the page has ended: {why}"))
         stack.callback(page.close)
         say_above(f"page: {url}")
+    if outputs.ghost:
+        write_poses(read_ghost(outputs.ghost, model), model, folder / GHOST_NAME)
     if outputs.view:
         stack.callback(start_window(folder, window_ended).close)
     stack.callback(feed.close)  # before the processes are waited for, which go by it

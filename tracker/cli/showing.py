@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ... import InputError
 from .names import BUNDLED, add_speaker_flag, check_model, named_model, poses_and_model, replayed
@@ -137,15 +137,13 @@ def read_ghost(text: str, model: TongueModel, speaker: str | None = None) -> Tra
 
 
 def _one_frame(poses: TrackedPoses, frame: int) -> TrackedPoses:
-    from dataclasses import fields
-
     import numpy as np
 
     arrays = {field.name: getattr(poses, field.name) for field in fields(poses)}
-    return replace(
-        poses,
-        **{name: rows[frame : frame + 1] for name, rows in arrays.items() if isinstance(rows, np.ndarray)},
-    )
+    rows: dict[str, Any] = {
+        name: values[frame : frame + 1] for name, values in arrays.items() if isinstance(values, np.ndarray)
+    }
+    return replace(poses, **rows)
 
 
 def _split(text: str) -> tuple[str, float | None]:

@@ -57,6 +57,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--coils", metavar="CHANNEL=ROLE,...", help="which channel is which coil, where names do not tell"
     )
     track.add_argument("--osc", metavar="HOST:PORT", help="also stream the poses over OSC")
+    track.add_argument("--view", action="store_true", help="show the poses in a window (extra 'viewer')")
     track.add_argument("--realtime", action="store_true", help="stream at the recording's own pace")
     track.add_argument("--json", action="store_true", help="the summary as JSON on stdout")
     add_recording_flags(track)
@@ -89,8 +90,8 @@ class Job:
 def run_track(args: argparse.Namespace) -> int:
     experiments = (1, 2) if args.experiment == "both" else (int(args.experiment),)
     jobs, left_out = plan_jobs(args.recordings, args.out, experiments)
-    if len(jobs) > 1 and (args.osc or args.save_session):
-        flag = "--osc" if args.osc else "--save-session"
+    if len(jobs) > 1 and (args.osc or args.save_session or args.view):
+        flag = "--osc" if args.osc else "--save-session" if args.save_session else "--view"
         raise InputError(f"{flag} takes one recording; {len(jobs)} were found. Track them one by one.")
     if args.realtime and not args.osc:
         raise InputError("--realtime paces a stream; say where to with --osc HOST:PORT.")
@@ -181,9 +182,25 @@ def _track_one(
         stream = stream_recording(recording, model, setup, args.osc, realtime=args.realtime, watch=watched)
         print(stream, file=sys.stderr)
         report["stream"] = stream.as_dict()
-    if not job.outputs and not args.osc:
-        print("  nothing was written; add --out poses.csv or --osc HOST:PORT", file=sys.stderr)
+    if args.view:
+        _show(run, model, job.path.stem)
+    if not job.outputs and not args.osc and not args.view:
+        print("  nothing was written; add --out poses.csv, --osc HOST:PORT or --view", file=sys.stderr)
     return report
+
+
+def _show(run: TrackingRun, model: TongueModel, name: str) -> None:
+    """The poses in a window. One that cannot be opened is a sentence: the tracking is done."""
+    from ..viewer.player import play
+    from ..viewer.scene import moments_of
+    from .showing import scene_to_show
+
+    poses = run.experiment_2 or run.experiment_1
+    assert poses is not None
+    try:
+        play(scene_to_show(poses, model, run.setup.session, name), moments_of(poses))
+    except InputError as reason:
+        print(f"  no window: {reason}", file=sys.stderr)
 
 
 def plan_jobs(

@@ -14,8 +14,8 @@ def figures(scene: Scene, moment: Moment) -> tuple[str, ...]:
         scene.names, moment.coils.tolist(), moment.residuals_mm.tolist(), strict=False
     ):
         if not isnan(place[0]):
-            where = ", ".join(f"{axis} {number:.1f}" for axis, number in zip("xyz", place))
-            off = "" if isnan(residual) else f"; {residual:.2f} off"
+            where = ", ".join(f"{axis} {round(number, 1) + 0.0}" for axis, number in zip("xyz", place))
+            off = "" if isnan(residual) else f", residual {residual:.2f}"
             lines.append(f"{name}: {where} mm{off}")
     weights = ", ".join(f"{weight:+.2f}" for weight in moment.normalised.tolist())
     return (*lines, f"weights: {weights} sigma")

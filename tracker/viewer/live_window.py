@@ -21,6 +21,7 @@ from ...model.multilinear import TongueModel
 from ..bundled import bundled_model
 from ..control import Control, ControlQueue
 from ..keyboard import KeyMeanings
+from ..outside import GHOST_NAME
 from ..pose import CoilState, PoseStatus
 from ..posefiles import read_poses
 from ..session import parse_session
@@ -35,8 +36,6 @@ SILENT_S = 0.5
 """Without a new pose for longer, the window says so."""
 TOLD_S = 2.0
 """So long it says what was asked of the run."""
-GHOST_NAME = "ghost.npz"
-"""In the feed's folder: poses of a tongue to compare with, where there is one."""
 KEYS = {"space": "marker", "t": "take", "f": "fix speaker"}
 GHOST_KEYS = {"g": "ghost here"}
 
@@ -59,7 +58,8 @@ def scene_of_feed(about: FeedAbout) -> Scene:
     """Raises InputError where the feed's model or session cannot be read."""
     model = bundled_model() if about.model == "bundled" else load_model(about.model)
     session = parse_session(about.session, "the run's session")
-    return scene_of(model, session, about.roles, about.correspondences, about.title)
+    title = f"{about.title}, {model.name}"  # the model's name says where it is synthetic
+    return scene_of(model, session, about.roles, about.correspondences, title)
 
 
 def _ghost_in(folder: Path) -> Ghost | None:

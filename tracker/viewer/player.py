@@ -43,7 +43,7 @@ class Player:
                 playback.looping = not playback.looping
             case "g":
                 self.ghost = None if self.ghost else Ghost(self.moments, playback.time_s)
-            case digit if digit in "0123456789":
+            case digit if digit in tuple("0123456789"):
                 playback.seek(int(digit) / 10)
 
     @property

@@ -85,9 +85,9 @@ def read_sound(path: Path, begin_s: float) -> Sound:
                 for frame in file.decode(stream):
                     frame.pts = None  # the samples follow each other
                     for piece in resampler.resample(frame):
-                        yield piece.to_ndarray()
+                        yield np.asarray(piece.to_ndarray(), dtype=np.float32)
                 for piece in resampler.resample(None):
-                    yield piece.to_ndarray()
+                    yield np.asarray(piece.to_ndarray(), dtype=np.float32)
         except av.FFmpegError as reason:
             raise InputError(f"{path}: the sound cannot be read ({_words(reason)}).") from reason
 

@@ -27,6 +27,8 @@ TIME_PX = 5
 """Height of the bar of time; it is grasped anywhere in the lowest `GRASPED_PX`."""
 GRASPED_PX = 18
 KEYS_IN_A_LINE = 4
+HELP_S = 15.0
+"""So long a new window shows what its keys do; afterwards `h` does."""
 SAMPLES = 4
 SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "swrast", "gdi generic")
 """Rasterisers on which smooth edges would cost most of the pictures."""
@@ -36,7 +38,7 @@ KEYS: Mapping[str, str] = {
     "c": "colour",
     "x": "trails",
     "l": "light, dark",
-    "h": "hide keys",
+    "h": "keys",
     "q": "close",
 }
 NO_DISPLAY = (
@@ -77,7 +79,7 @@ class Window:
         self.view: View = home_view(scene)
         self.keys = {**(keys or {}), **KEYS}
         self.pressed, self.scrubbed = pressed, scrubbed
-        self.help_shown = True
+        self._help_until_s = time.perf_counter() + HELP_S
         self._glfw = glfw = _imported_glfw()
         self._complaints: list[str] = []
         glfw.set_error_callback(lambda code, words: self._complaints.append(_plain(words)))
@@ -119,8 +121,10 @@ class Window:
 
     @property
     def help(self) -> tuple[str, ...]:
-        """What keys do, as lines for the picture; none while they are hidden."""
-        words = [f"{key}: {words}" for key, words in self.keys.items()] if self.help_shown else []
+        """What keys do, as lines for the picture; after a while that `h` shows them again."""
+        if time.perf_counter() > self._help_until_s:
+            return (f"h: {KEYS['h']}",)
+        words = [f"{key}: {words}" for key, words in self.keys.items()]
         return tuple(
             " | ".join(words[row : row + KEYS_IN_A_LINE]) for row in range(0, len(words), KEYS_IN_A_LINE)
         )
@@ -175,7 +179,8 @@ class Window:
             case "l":
                 self.look = LIGHT if self._look is DARK else DARK
             case "h":
-                self.help_shown = not self.help_shown
+                hidden = time.perf_counter() > self._help_until_s
+                self._help_until_s = float("inf") if hidden else 0.0
             case other:
                 self.pressed(other)
 
