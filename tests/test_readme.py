@@ -20,7 +20,12 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-SAMPLES = ("recordings/demo.csv", "recordings/demo.session.toml", "model/data/default.npz")
+SAMPLES = (
+    "recordings/demo.csv",
+    "recordings/demo.palate.csv",
+    "recordings/demo.session.toml",
+    "model/data/default.npz",
+)
 
 BY_CI = "by .ci/run, word for word"
 HERE = "here, in a folder of its own, in the order of the page"
@@ -143,6 +148,8 @@ DOCS = {
     ".venv/bin/tonguetrack anatomy recordings/demo.csv --session session.toml"
     " --mesh tongue_000500.ply tongue_001500.ply tongue_002500.ply": HERE,
     ".venv/bin/tonguetrack convert recordings/demo.csv demo.npz": HERE,
+    ".venv/bin/tonguetrack simulate recording hello.csv --speaker 5 --palate hello.palate.csv": HERE,
+    ".venv/bin/tonguetrack track recordings/demo.csv --palate recordings/demo.palate.csv --save-session session.toml": HERE,
     ".venv/bin/tonguetrack simulate recording visit.csv --seconds 4 --head-motion --dropouts 0.05 "
     "--coils tongue_tip,tongue_blade,tongue_dorsum,head_nose,head_left,head_right,head_upper_incisor": HERE,
     ".venv/bin/tonguetrack calibrate visit.csv --rest 0:1 --smoothing carstens -o speaker.toml --report calibration": HERE,
