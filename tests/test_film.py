@@ -232,6 +232,21 @@ def test_without_the_extra_a_film_becomes_pictures_and_a_command(drawn, capsys, 
 # Pictures -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("name", ["film.webp", "film.gif"])
+def test_a_picture_that_moves_has_the_part_of_the_take_that_was_asked_for(drawn, name):
+    assert main(["render", "poses.csv", "-o", name, "--fps", "20", "--seconds", "0.25:0.75", *SMALL]) == 0
+    assert main(["render", "poses.csv", "-o", "still.png", "--frame", "5", *SMALL]) == 0
+    film = Image.open(drawn / name)
+    assert (film.n_frames, film.size) == (11, (320, 240))
+    first = np.asarray(film.convert("RGB"))
+    film.seek(10)
+    film.load()
+    assert film.info["duration"] == 50
+    # Frame 5 is 0.25 s; a still has the trails that lead there, the first picture of a film has none.
+    assert unlike(np.asarray(Image.open("still.png").convert("RGB")), first).mean() < 0.06
+    assert unlike(first, np.asarray(film.convert("RGB"))).mean() > 0.01
+
+
 @pytest.mark.parametrize(
     ("output", "names"),
     [
@@ -312,7 +327,12 @@ def test_a_take_is_drawn_with_the_session_in_it(drawn, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["-o", "a.gif"], "films are written as .mp4, pictures as .png"),
+        (["-o", "a.avi"], "films are written as .mp4, .webp or .gif, pictures as .png"),
+        (["-o", "a.webp", "--seconds", "0.5"], "--seconds 0.5: expected a first and a last second"),
+        (["-o", "a.webp", "--seconds", "0.5:2"], "poses, tonguetrack synthetic tongue has the seconds 0 to 1"),
+        (["-o", "a.webp", "--seconds", "0.5:0.2"], "--seconds 0.5:0.2"),
+        (["-o", "a.webp", "--seconds", "nan:0.2"], "--seconds nan:0.2"),
+        (["-o", "a.png", "--seconds", "0:1", "--frame", "2"], "--frame makes one picture, --seconds many"),
         (["-o", "a.mp4", "--frame", "3"], "--frame makes one picture"),
         (["-o", "a.png", "--audio", "x.wav"], "--audio belongs to a film"),
         (

@@ -35,7 +35,8 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "render",
         help="tracked poses or a take as a film or pictures",
         description="Draws poses or a take without a window. .mp4: a film (extra 'video'; without it, numbered pictures); "
-        ".png: numbered pictures, or with --frame one; a folder: pictures in it. Needs the extra 'viewer'.",
+        ".webp, .gif: a picture that moves; .png: numbered pictures, or with --frame one; a folder: pictures in it. "
+        "Needs the extra 'viewer'.",
     )
     add_show_flags(render)
     render.add_argument(
@@ -49,6 +50,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--fps", type=float, default=FPS, metavar="N", help=f"pictures a second (default {FPS:g})"
     )
     render.add_argument("--frame", type=int, metavar="N", help="one picture, of this frame, counted from 0")
+    render.add_argument("--seconds", metavar="A:B", help="only from second A to second B of the poses' time")
     render.set_defaults(run=run_render)
 
 
@@ -61,23 +63,27 @@ def run_view(args: argparse.Namespace) -> int:
 
 
 def run_render(args: argparse.Namespace) -> int:
-    from ..viewer.film import Shot, can_film, write_film, write_pictures, write_still
+    from ..viewer.film import Shot, can_film, write_animation, write_film, write_pictures, write_still
 
-    target, is_film = _target(args)
+    target, kind = _target(args)
+    size, part_s = _size(args.size), _part(args.seconds)
     what = shown(args)
-    shot = Shot(what.scene, what.moments, what.look, what.colour_by, what.ghost, _size(args.size), args.fps)
+    shot = Shot(what.scene, what.moments, what.look, what.colour_by, what.ghost, size, args.fps, part_s)
     keep_apart([target], [Path(args.file)])
     prepare_folder(target)
     if args.frame is not None:
         write_still(shot.still(args.frame), target)
         print(f"written: {target} ({_what(shot)})", file=sys.stderr)
         return 0
-    if is_film and not can_film():
+    if kind == ".mp4" and not can_film():
         print(_without_video(args, target, shot), file=sys.stderr)
-        target, is_film = target.with_suffix(".png"), False
-    if is_film:
+        target, kind = target.with_suffix(".png"), ".png"
+    if kind == ".mp4":
         audio = Path(args.audio) if args.audio else None
         write_film(_with_progress(shot), target, shot.fps, shot.begin_s, shot.size, audio)
+    elif kind != ".png":
+        write_animation(_with_progress(shot), target, shot.fps)
+    if kind != ".png":
         print(f"written: {target} ({_what(shot)}, {shot.picture_count} pictures)", file=sys.stderr)
     else:
         write_pictures(_with_progress(shot), target)
@@ -85,21 +91,34 @@ def run_render(args: argparse.Namespace) -> int:
     return 0
 
 
-def _target(args: argparse.Namespace) -> tuple[Path, bool]:
-    """The output's name, and whether it is a film. Raises InputError for what nothing here could write."""
+def _target(args: argparse.Namespace) -> tuple[Path, str]:
+    """The output's name, and what it is by its suffix. Raises InputError for what nothing here could write."""
     target = Path(args.output)
     if args.output.endswith(("/", os.sep)) or target.is_dir():
         target = target / "tongue.png"
     suffix = target.suffix.lower()
-    if suffix not in (".mp4", ".png"):
+    if suffix not in (".mp4", ".webp", ".gif", ".png"):
         raise InputError(
-            f"{target}: films are written as .mp4, pictures as .png; end the name in one of them, or in / for a folder."
+            f"{target}: films are written as .mp4, .webp or .gif, pictures as .png; end the name in one of them, or in / "
+            "for a folder."
         )
     if args.frame is not None and suffix != ".png":
         raise InputError(f"--frame makes one picture; end {target} in .png.")
+    if args.frame is not None and args.seconds:
+        raise InputError("--frame makes one picture, --seconds many; give one of them.")
     if args.audio and suffix != ".mp4":
         raise InputError(f"--audio belongs to a film; end {target} in .mp4.")
-    return target, suffix == ".mp4"
+    return target, suffix
+
+
+def _part(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        begin_s, end_s = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise InputError(f"--seconds {text}: expected a first and a last second, such as 2.5:6.") from None
+    return begin_s, end_s
 
 
 def _size(text: str) -> tuple[int, int]:

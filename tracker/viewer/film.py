@@ -34,6 +34,7 @@ SAMPLES = 4
 SMALLEST_PX, LARGEST_PX = 160, 8192
 MOST_FPS = 1000.0
 CRF = "18"  # of x264: hardly to be told from the pictures themselves
+WEBP_QUALITY = 70
 SOUND_CHUNK = 1024  # samples, as AAC has them in a frame
 NO_VIDEO = "films need the extra 'video': pip install 'tonguetrack[video]'."
 
@@ -43,7 +44,10 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Shot:
-    """What is filmed, and how it looks. size: (width, height) pixels; fps: pictures a second."""
+    """What is filmed, and how it looks. size: (width, height) pixels; fps: pictures a second.
+
+    part_s: from when to when, in the poses' own time; None = all of it.
+    """
 
     scene: Scene
     moments: Moments
@@ -52,6 +56,7 @@ class Shot:
     ghost: Ghost | None = None
     size: tuple[int, int] = SIZE
     fps: float = FPS
+    part_s: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not all(SMALLEST_PX <= side <= LARGEST_PX for side in self.size):
@@ -60,17 +65,23 @@ class Shot:
             )
         if not 0 < self.fps <= MOST_FPS:
             raise InputError(f"--fps {self.fps:g}: expected more than 0 and at most {MOST_FPS:g}.")
-        check_times(self.moments.times_s, self.scene.title)
+        times = self.moments.times_s
+        check_times(times, self.scene.title)
+        if self.part_s is not None and not times[0] <= self.part_s[0] < self.part_s[1] <= times[-1]:
+            raise InputError(
+                f"--seconds {self.part_s[0]:g}:{self.part_s[1]:g}: {self.scene.title} has the seconds "
+                f"{times[0]:g} to {times[-1]:g}; give two of them, the first one first."
+            )
 
     @property
     def begin_s(self) -> float:
-        return float(self.moments.times_s[0])
+        return float(self.moments.times_s[0]) if self.part_s is None else self.part_s[0]
 
     @property
     def picture_count(self) -> int:
         """From the first frame's time to the last one's."""
-        length_s = float(self.moments.times_s[-1]) - self.begin_s
-        return int(length_s * self.fps + 1e-6) + 1
+        end_s = float(self.moments.times_s[-1]) if self.part_s is None else self.part_s[1]
+        return int((end_s - self.begin_s) * self.fps + 1e-6) + 1
 
     def pictures(self) -> Iterator[Picture]:
         """One after the other, `fps` for every second of the take."""
@@ -123,6 +134,24 @@ def png(picture: Picture, fast: bool = False) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, "PNG", compress_level=1 if fast else 9)
     return buffer.getvalue()
+
+
+def write_animation(pictures: Iterable[Picture], target: Path, fps: float) -> None:
+    """A picture that moves, over and over, as WebP or GIF by the target's suffix: for pages that play no films."""
+    from PIL import Image
+
+    kind = target.suffix[1:].upper()
+    # GIF knows hundredths of a second only.
+    unit_ms = 10 if kind == "GIF" else 1
+    duration_ms = max(1, round(1000.0 / fps / unit_ms)) * unit_ms
+    images = (Image.fromarray(picture) for picture in pictures)
+
+    def write(file: BinaryIO) -> None:
+        first = next(images)
+        options: dict[str, Any] = {"quality": WEBP_QUALITY, "method": 4} if kind == "WEBP" else {}
+        first.save(file, kind, save_all=True, append_images=images, duration=duration_ms, loop=0, **options)
+
+    write_atomically(target, write)
 
 
 # Films ----------------------------------------------------------------------------------------------
