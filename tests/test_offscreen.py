@@ -36,7 +36,8 @@ def model():
 def scene(model):
     _, session = bundled_recording()
     roles, vertices = tuple(session.correspondences), tuple(session.correspondences.values())
-    return scene_of(model, session, roles, vertices, BARE)
+    bare = dataclasses.replace(session, palate=None)  # a line that would hide some of the tongue
+    return scene_of(model, bare, roles, vertices, BARE)
 
 
 @pytest.fixture(scope="module")

@@ -35,10 +35,10 @@ def model():
 
 @pytest.fixture(scope="module")
 def scene(model):
+    """The demo's, without its palate."""
     _, session = bundled_recording()
-    return scene_of(
-        model, session, tuple(session.correspondences), tuple(session.correspondences.values()), "a demo"
-    )
+    roles, vertices = tuple(session.correspondences), tuple(session.correspondences.values())
+    return scene_of(model, dataclasses.replace(session, palate=None), roles, vertices, "a demo")
 
 
 # Scenes and moments ---------------------------------------------------------------------------------
