@@ -329,7 +329,10 @@ def test_a_take_is_drawn_with_the_session_in_it(drawn, capsys):
     [
         (["-o", "a.avi"], "films are written as .mp4, .webp or .gif, pictures as .png"),
         (["-o", "a.webp", "--seconds", "0.5"], "--seconds 0.5: expected a first and a last second"),
-        (["-o", "a.webp", "--seconds", "0.5:2"], "poses, tonguetrack synthetic tongue has the seconds 0 to 1"),
+        (
+            ["-o", "a.webp", "--seconds", "0.5:2"],
+            "poses, tonguetrack synthetic tongue has the seconds 0 to 1",
+        ),
         (["-o", "a.webp", "--seconds", "0.5:0.2"], "--seconds 0.5:0.2"),
         (["-o", "a.webp", "--seconds", "nan:0.2"], "--seconds nan:0.2"),
         (["-o", "a.png", "--seconds", "0:1", "--frame", "2"], "--frame makes one picture, --seconds many"),
