@@ -227,6 +227,46 @@ def test_a_writer_that_was_killed_is_over(writer, tmp_path):
         assert feed.over
 
 
+READER = """
+import sys, time
+from tonguetrack.tracker.streams.feed import FeedReader
+with FeedReader(sys.argv[1]) as feed:
+    print("reading", flush=True)
+    while not feed.over:
+        time.sleep(0.02)
+    print("over", flush=True)
+"""
+
+# Starts its own reader, as the tracker starts the window and the page; the reader keeps our stdout.
+PARENT = f"""
+import subprocess
+subprocess.Popen([sys.executable, "-c", {READER!r}, sys.argv[1]])
+time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there, nobody gets another parent")
+def test_a_child_of_a_writer_that_was_killed_and_is_waited_for_by_nobody_is_not_left_behind(tmp_path):
+    """Its number is still taken then: by what is left of it, or by another process."""
+    source = WRITER.split("number = 0")[0] + PARENT
+    writer = subprocess.Popen(
+        [sys.executable, "-c", source, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert [writer.stdout.readline() for _ in range(2)] == ["there\n", "reading\n"]
+        writer.kill()
+        os.waitid(os.P_PID, writer.pid, os.WEXITED | os.WNOWAIT)  # dead, and not waited for
+        said = []
+        told = threading.Thread(target=lambda: said.append(writer.stdout.readline()), daemon=True)
+        told.start()
+        told.join(PATIENCE_S)
+        assert said == ["over\n"]
+    finally:
+        writer.kill()
+        writer.wait()
+        writer.stdout.close()
+
+
 # Readers and the writer ---------------------------------------------------------------------------------
 
 

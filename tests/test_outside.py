@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -16,8 +17,10 @@ import pytest
 from tonguetrack import InputError
 from tonguetrack.tracker import outside
 from tonguetrack.tracker.cli import main
-from tonguetrack.tracker.outside import Beside, feed_folder
-from tonguetrack.tracker.streams.feed import process_lives
+from tonguetrack.tracker.outside import Beside
+from tonguetrack.tracker.streams import feedfolder
+from tonguetrack.tracker.streams.feed import FeedAbout, FeedSink, process_lives
+from tonguetrack.tracker.streams.feedfolder import feed_folder
 
 PATIENCE_S = 60.0
 SESSION = str(Path(__file__).resolve().parents[1] / "recordings" / "demo.session.toml")
@@ -145,6 +148,33 @@ def test_the_feeds_folder_is_private_and_gone_afterwards():
         assert folder.stat().st_mode & 0o777 == 0o700
         (folder / "feed").write_bytes(b"x")
     assert not folder.exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="SIGKILL")
+def test_what_a_killed_run_left_behind_is_cleared_away_by_the_next_and_nothing_else_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(feedfolder, "MEMORY_FOLDER", tmp_path)
+    code = (
+        "import os, signal; from pathlib import Path; from tonguetrack.tracker.streams import feedfolder; "
+        "from tonguetrack.tracker.streams.feed import FeedAbout, FeedSink; "
+        f"feedfolder.MEMORY_FOLDER = Path({str(tmp_path)!r}); keeper = feedfolder.feed_folder(); folder = keeper.__enter__(); "
+        "FeedSink(folder, FeedAbout('bundled', '', ('a',), (1,), 4, 5)); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    subprocess.run([sys.executable, "-c", code], timeout=PATIENCE_S, check=False)
+    [left_behind] = tmp_path.iterdir()
+    (left_behind / "ghost.npz").write_bytes(b"x")
+    (tmp_path / "tonguetrack-notes").mkdir()
+    (tmp_path / "tonguetrack-notes" / "of mine.txt").write_text("keep me")
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(left_behind, elsewhere)
+    (tmp_path / "tonguetrack-link").symlink_to(elsewhere)
+    with feed_folder() as ours:
+        feed = FeedSink(ours, FeedAbout("bundled", "", ("a",), (1,), 4, 5))
+        with feed_folder() as second:
+            assert ours.exists() and second.exists(), "a run that lasts is left alone"
+        assert not left_behind.exists()
+        assert (tmp_path / "tonguetrack-notes" / "of mine.txt").exists()
+        assert (elsewhere / "feed").exists()
+        feed.close()
 
 
 # As a user meets it ---------------------------------------------------------------------------------------

@@ -1,22 +1,20 @@
 """Processes of our own beside the tracker: the window and the page's server.
 
 They are processes and not threads, so that neither a graphics driver nor a browser can ever hold the tracker's
-interpreter. Both read a feed (`streams/feed.py`) in a private folder that is there for one run.
+interpreter. Both read a feed (`streams/feed.py`) in a private folder (`streams/feedfolder.py`).
 """
 
 from __future__ import annotations
 
 import os
 import queue
-import shutil
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
@@ -35,22 +33,6 @@ CLOSE_S = 3.0
 """So long a process may take to see that the feed is over, before it is ended."""
 NICENESS = 5
 """The tracker goes before what shows it."""
-MEMORY_FOLDER = Path("/dev/shm")
-
-
-@contextmanager
-def feed_folder() -> Iterator[Path]:
-    """A folder for this user alone, gone afterwards.
-
-    In memory where the system offers that: a mapped file on a disk makes its writer wait now and then, while the
-    system writes its pages.
-    """
-    in_memory = MEMORY_FOLDER.is_dir() and os.access(MEMORY_FOLDER, os.W_OK | os.X_OK)
-    folder = tempfile.mkdtemp(prefix="tonguetrack-", dir=MEMORY_FOLDER if in_memory else None)
-    try:
-        yield Path(folder)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 class Beside:

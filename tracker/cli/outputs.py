@@ -167,10 +167,11 @@ def _show(
     window_closed: Callable[[], None],
 ) -> FeedSink:
     """The feed, and the processes that show it."""
-    from ..outside import GHOST_NAME, feed_folder, start_page, start_window
+    from ..outside import GHOST_NAME, start_page, start_window
     from ..posefiles import write_poses
     from ..session import session_toml
     from ..streams.feed import FeedAbout, FeedSink
+    from ..streams.feedfolder import feed_folder
     from .showing import read_ghost
     from .watching import say_above
 

@@ -238,6 +238,7 @@ class FeedReader:
         self._ends = np.cumsum([k, k, m, n, 3 * n]).tolist()
         self._numbers = FeedNumbers()
         self._numbers_seen = 0
+        self._is_child = os.getppid() == self.about.pid
 
     def __enter__(self) -> Self:
         return self
@@ -282,7 +283,11 @@ class FeedReader:
     @property
     def over(self) -> bool:
         """Whether no more poses will come: the writer has closed the feed, or its process is gone."""
-        return bool(_WORD.unpack_from(self._map, _CLOSED_AT)[0]) or not process_lives(self.about.pid)
+        if _WORD.unpack_from(self._map, _CLOSED_AT)[0] or not process_lives(self.about.pid):
+            return True
+        # A number is taken until somebody has waited for a dead process, and can be given to another one afterwards;
+        # but its children have another parent at once.
+        return self._is_child and os.getppid() != self.about.pid
 
     def _newest_sequence(self) -> int:
         return int(_WORD.unpack_from(self._map, _NEWEST_AT)[0])
