@@ -117,7 +117,7 @@ def test_the_wheel_holds_every_module_and_data_file_of_the_tree(built):
     expected = {"tonguetrack/py.typed"}
     for package, folder in FOLDERS.items():
         place = package.replace(".", "/")
-        data = package in ("tonguetrack.model.data", "tonguetrack.recordings")
+        data = package in PACKAGES_WITH_DATA
         expected |= {
             f"{place}/{file.name}"
             for file in (ROOT / folder).iterdir()
