@@ -12,6 +12,8 @@ from collections.abc import Callable
 
 HTTP_TYPE, OSC_TYPE = "_oscjson._tcp.local.", "_osc._udp.local."
 EVERYWHERE = ("0.0.0.0", "::")
+OWN_NAME = f"tonguetrack-{os.getpid()}.local."
+"""Of this computer, as those know it who have found an announced server."""
 CLOSE_S = 2.0
 
 
@@ -61,7 +63,7 @@ class Announcement:
                             kind,
                             f"{self._name}.{kind}",
                             port,
-                            server=f"tonguetrack-{os.getpid()}.local.",
+                            server=OWN_NAME,
                             parsed_addresses=addresses,
                         )
                         network.register_service(service, allow_name_change=True)

@@ -66,7 +66,8 @@ def _take(kind: ControlKind, rest: list[object], time_ns: int) -> Control | None
 
 
 def control_message(control: Control) -> bytes:
-    """The datagram that asks for it, as `control_of` understands it; not for "quit", which is asked for elsewhere."""
+    """The datagram that asks for it. Raises ValueError for a text that `control_of` would not take, and for "quit",
+    which is asked for elsewhere."""
     match control.kind:
         case "mark":
             path, values = CONTROL_MARKERS[0], [control.text]
@@ -78,6 +79,8 @@ def control_message(control: Control) -> bytes:
             path, values = CONTROL_SPEAKER, [control.kind.removesuffix("_speaker")]
         case other:
             raise ValueError(f"no message asks for {other}")
+    if control_of(path, list(values), control.time_ns) is None:
+        raise ValueError(f"'{control.text[:MAX_CONTROL_TEXT]}' would not be obeyed")
     builder = OscMessageBuilder(path)
     for value in values:
         builder.add_arg(value, "s")

@@ -18,7 +18,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from ipaddress import ip_address
 from socketserver import TCPServer
 from typing import Any
 from urllib.parse import unquote
@@ -39,8 +38,9 @@ from .addresses import (
     Address,
     Argument,
 )
-from .announcing import EVERYWHERE, Announcement
+from .announcing import EVERYWHERE, OWN_NAME, Announcement
 from .contact import REGIONS
+from .hosts import is_loopback, names_this_computer
 from .monitor import decode
 from .osc import CoilStatesDatagram, FrameBundle, info_datagrams, numbers_datagram, parse_destination, resolve
 from .osc_more import MoreDatagrams, rebased_directions
@@ -332,7 +332,11 @@ class _Server(ThreadingHTTPServer):
                 f"oscquery {address}: cannot listen there ({reason.strerror}); give another HOST:PORT, port 0 is any."
             ) from reason
         self.host, self.port = str(self.server_address[0]), int(self.server_address[1])
-        self.is_local = ip_address(self.host.partition("%")[0]).is_loopback
+        self._named = parse_destination(address, lowest_port=0)[0]
+
+    def knows_host(self, header: str) -> bool:
+        """Whether it may be answered: always, unless only this computer is meant to ask."""
+        return not is_loopback(self.host) or names_this_computer(header, self._named, OWN_NAME)
 
     def serve(self) -> None:
         self._serving = True
@@ -392,7 +396,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(with_body=False)
 
     def _answer(self, with_body: bool) -> None:
-        if self.server.is_local and not _is_local_name(self.headers.get("Host", "localhost")):
+        if not self.server.knows_host(self.headers.get("Host", "localhost")):
             status, kind, body = HTTPStatus.FORBIDDEN, "text/plain", b"this computer is not called that"
         else:
             status, kind, body = self.server.answer(self.path, str(self.connection.getsockname()[0]))
@@ -408,15 +412,3 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing: what is asked is nobody's business."""
-
-
-def _is_local_name(host: str) -> bool:
-    """Whether a Host header names this computer, and not a site of the internet whose name leads here."""
-    name = host.rpartition(":")[0] if host.rpartition(":")[2].isdigit() else host
-    name = name.strip("[]").rstrip(".").lower()
-    if name == "localhost" or name.endswith(".local"):
-        return True
-    try:
-        return ip_address(name).is_loopback
-    except ValueError:
-        return False

@@ -31,9 +31,10 @@ from typing import Any
 
 import numpy as np
 
+from ...control import Control, ControlKind
 from ...pose import FloatArray, TrackedPose
-from ..addresses import CONTROL_MARKERS, CONTROL_SPEAKER, CONTROL_TAKE, MAX_CONTROL_TEXT
-from ..control_osc import control_of
+from ..addresses import MAX_CONTROL_TEXT
+from ..control_osc import control_message
 from ..feed import FeedNumbers
 from ..sink import Pair
 
@@ -207,30 +208,24 @@ def from_page(text: str) -> Seen | Wish:
         ):
             return Seen(number)
         case {"do": "take", "on": bool(on), **rest} if set(rest) <= {"name"}:
-            word = "start" if on else "stop"
             match rest.get("name", ""):
                 case str(name):
-                    return _wish("take", CONTROL_TAKE, [word, name] if on and name else [word])
+                    return _wish("take", "take_start", name) if on else _wish("take", "take_stop")
         case {"do": "mark", "text": str(mark), **rest} if not rest:
-            return _wish("mark", CONTROL_MARKERS[0], [mark])
+            return _wish("mark", "mark", mark)
         case {"do": "speaker", "fix": bool(fix), **rest} if not rest:
-            return _wish("speaker", CONTROL_SPEAKER, ["fix" if fix else "free"])
+            return _wish("speaker", "fix_speaker" if fix else "free_speaker")
     raise NotUnderstood("not a message of the page")
 
 
-def _wish(what: str, path: str, values: list[str]) -> Wish:
-    from pythonosc.osc_message_builder import OscMessageBuilder
-
-    # The same rules as at the other end, so that nothing is passed on that would be ignored there.
-    if control_of(path, list(values), 0) is None:
+def _wish(what: str, kind: ControlKind, text: str = "") -> Wish:
+    try:
+        return Wish(what, control_message(Control(kind, text)))
+    except ValueError as reason:
         raise NotUnderstood(
             f"a {what} takes at most {MAX_CONTROL_TEXT} printable characters, and a take's name letters, digits, "
             "spaces and _-. only"
-        )
-    builder = OscMessageBuilder(path)
-    for value in values:
-        builder.add_arg(value, "s")
-    return Wish(what, builder.build().dgram)
+        ) from reason
 
 
 def _text(kind: str, **content: Any) -> str:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
-import re
 import secrets
 import socket
 from dataclasses import dataclass
 
+from ..hosts import is_loopback, names_this_computer
 from ..osc import parse_destination, resolve
 
 TOKEN_BYTES = 18
-_HOST_HEADER = re.compile(r"(?:\[(?P<v6>[0-9a-fA-F:.]+)\]|(?P<name>[\w.-]+))(?::\d+)?")
 
 
 @dataclass(frozen=True)
@@ -47,16 +46,8 @@ class Door:
         return path[len(self.prefix) :]
 
     def knows_host(self, host_header: str) -> bool:
-        """Whether the browser asked for this very computer.
-
-        Without a token, a page of somebody else's could otherwise reach this one through a name of its own that
-        leads to 127.0.0.1 (DNS rebinding). A token makes that impossible.
-        """
-        if self.token:
-            return True
-        named = _HOST_HEADER.fullmatch(host_header)
-        name = (named["v6"] or named["name"]).lower() if named else ""
-        return name in ("localhost", self.host.lower()) or is_loopback(name)
+        """Whether the browser asked for this very computer. With a token, others cannot ask for anything anyway."""
+        return bool(self.token) or names_this_computer(host_header, self.host)
 
 
 def door_at(address: str) -> Door:
@@ -69,13 +60,6 @@ def door_at(address: str) -> Door:
 def same_origin(origin: str | None, host_header: str) -> bool:
     """Whether a page that was loaded from here asks. Programs that are no browsers send no Origin."""
     return origin is None or origin in (f"http://{host_header}", f"https://{host_header}")
-
-
-def is_loopback(address: str) -> bool:
-    try:
-        return ipaddress.ip_address(address).is_loopback
-    except ValueError:
-        return False
 
 
 def reachable_address(place: str) -> str:
