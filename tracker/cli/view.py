@@ -63,7 +63,15 @@ def run_view(args: argparse.Namespace) -> int:
 
 
 def run_render(args: argparse.Namespace) -> int:
-    from ..viewer.film import Shot, can_film, write_animation, write_film, write_pictures, write_still
+    from ..viewer.film import (
+        Shot,
+        can_film,
+        check_animation,
+        write_animation,
+        write_film,
+        write_pictures,
+        write_still,
+    )
 
     target, kind = _target(args)
     size, part_s = _size(args.size), _part(args.seconds)
@@ -82,6 +90,7 @@ def run_render(args: argparse.Namespace) -> int:
         audio = Path(args.audio) if args.audio else None
         write_film(_with_progress(shot), target, shot.fps, shot.begin_s, shot.size, audio)
     elif kind != ".png":
+        check_animation(shot)
         write_animation(_with_progress(shot), target, shot.fps)
     if kind != ".png":
         print(f"written: {target} ({_what(shot)}, {shot.picture_count} pictures)", file=sys.stderr)

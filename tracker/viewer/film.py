@@ -32,7 +32,9 @@ SIZE = (1280, 720)
 FPS = 60.0
 SAMPLES = 4
 SMALLEST_PX, LARGEST_PX = 160, 8192
-MOST_FPS = 1000.0
+LEAST_FPS, MOST_FPS = 0.01, 1000.0
+MOST_ANIMATED_BYTES = 2 * 2**30
+"""WebP and GIF are made of all their pictures at once, which are in memory until then."""
 CRF = "18"  # of x264: hardly to be told from the pictures themselves
 WEBP_QUALITY = 70
 SOUND_CHUNK = 1024  # samples, as AAC has them in a frame
@@ -63,8 +65,8 @@ class Shot:
             raise InputError(
                 f"--size {self.size[0]}x{self.size[1]}: expected {SMALLEST_PX} to {LARGEST_PX} pixels each way."
             )
-        if not 0 < self.fps <= MOST_FPS:
-            raise InputError(f"--fps {self.fps:g}: expected more than 0 and at most {MOST_FPS:g}.")
+        if not LEAST_FPS <= self.fps <= MOST_FPS:
+            raise InputError(f"--fps {self.fps:g}: expected {LEAST_FPS:g} to {MOST_FPS:g}.")
         times = self.moments.times_s
         check_times(times, self.scene.title)
         if self.part_s is not None and not times[0] <= self.part_s[0] < self.part_s[1] <= times[-1]:
@@ -136,8 +138,21 @@ def png(picture: Picture, fast: bool = False) -> bytes:
     return buffer.getvalue()
 
 
+def check_animation(shot: Shot) -> None:
+    """Raises InputError where the pictures of a WebP or GIF would be too many for a computer's memory."""
+    needed = shot.picture_count * shot.size[0] * shot.size[1] * 3
+    if needed > MOST_ANIMATED_BYTES:
+        raise InputError(
+            f"{shot.picture_count} pictures of {shot.size[0]}x{shot.size[1]} need {needed / 2**30:.1f} GiB of memory as a "
+            f"picture that moves, {MOST_ANIMATED_BYTES / 2**30:g} at most; give --seconds, a smaller --size or --fps, or make a .mp4."
+        )
+
+
 def write_animation(pictures: Iterable[Picture], target: Path, fps: float) -> None:
-    """A picture that moves, over and over, as WebP or GIF by the target's suffix: for pages that play no films."""
+    """A picture that moves, over and over, as WebP or GIF by the target's suffix: for pages that play no films.
+
+    All its pictures are in memory at once; `check_animation` says whether that may be.
+    """
     from PIL import Image
 
     kind = target.suffix[1:].upper()
