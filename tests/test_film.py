@@ -19,6 +19,7 @@ from PIL import Image
 from tonguetrack import InputError
 from tonguetrack.tracker.bundled import bundled_model, bundled_recording
 from tonguetrack.tracker.cli import main
+from tonguetrack.tracker.cli.showing import read_ghost
 from tonguetrack.tracker.palate import curve_palate
 from tonguetrack.tracker.pose import TrackedPoses
 from tonguetrack.tracker.posefiles import read_poses, write_poses
@@ -321,7 +322,22 @@ def test_a_take_is_drawn_with_the_session_in_it(drawn, capsys):
     assert main([*command, "--session", str(session), "--control", "127.0.0.1:0"]) == 0
     assert main(["render", "take.xdf", "-o", "a.png", "--frame", "100", *SMALL]) == 0
     assert "take, tonguetrack synthetic tongue" in capsys.readouterr().err
+    assert read_ghost("take.xdf@0.5", bundled_model()).frame_count == 1
     assert unlike(np.asarray(Image.open("a.png")), np.round(255 * np.array(DARK.background))).mean() > 0.1
+
+
+def test_a_ghost_belongs_to_the_model_that_is_shown_wherever_that_is(take):
+    """Not to the one that its file names: that may have been moved, and a take names none."""
+    other = bundled_model().truncated(5, 3)
+    poses = made_poses()
+    poses = replace(
+        poses, weights=poses.weights[:, :3], normalised=poses.normalised[:, :3], model_path="nowhere.npz",
+        model_fingerprint=other.fingerprint,
+    )  # fmt: skip
+    write_poses(poses, other, "other.csv")
+    assert read_ghost("other.csv@0.5", other).frame_count == 1
+    with pytest.raises(InputError, match="tracked with the model"):
+        read_ghost("other.csv", bundled_model())
 
 
 @pytest.mark.parametrize(

@@ -121,10 +121,12 @@ def scene_to_show(poses: TrackedPoses, model: TongueModel, session: Session, nam
 def read_ghost(text: str, model: TongueModel, speaker: str | None = None) -> TrackedPoses:
     """FILE[@SECONDS]: all poses, or the one at that time. Raises InputError where they are of another model, or the
     file does not reach that time."""
+    from ..posefiles import read_poses
+    from ..takes.reading import read_take
     from ..viewer.playback import check_times, frame_at
 
     path, at_s = _split(text)
-    poses, _, _ = poses_to_show(path, None)
+    poses = read_take(path).poses() if Path(path).suffix.lower() == ".xdf" else read_poses(path, model)
     check_model(poses, model, path)
     poses, _ = replayed(poses, model, speaker)
     check_times(poses.times_s, path)
