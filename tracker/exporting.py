@@ -90,7 +90,7 @@ def motion_glb(
     shown = (poses.roles, poses.coils[frames]) if coils else None
     if shown is not None and np.isnan(shown[1]).all():
         raise InputError("there is no coil in any of these poses, so none can be shown.")
-    line = None if palate is None else np.column_stack([np.zeros(len(palate.curve[0])), *palate.curve])
+    line = None if palate is None else palate.line
     clip = (poses.times_s[frames], motion.weights)
     content = glb(motion.speaker, rebased, model.name, clip, line, shown, motion.names)
     return content, int(outside.sum())

@@ -15,7 +15,6 @@ import numpy as np
 
 from ... import InputError
 from ...model.multilinear import SpeakerModel, TongueModel
-from ...model.rebasing import Rebased
 from ..pose import FloatArray, TrackedPose
 from .addresses import (
     COIL,
@@ -32,7 +31,7 @@ from .addresses import (
 )
 from .contact import ContactMeter
 from .packing import BUNDLE_HEADER, SEQUENCE_MASK, NumbersMessage, bundles_of, osc_message
-from .shapes import SIGMAS, ShapeMeter
+from .shapes import ShapeMeter, rebased_pose
 from .sink import StreamContext, StreamInfo
 from .udp import UdpSender
 
@@ -126,7 +125,7 @@ class _Shapes:
         self._meter = ShapeMeter(context.model, context.ranges) if shapes else None
         names = self._meter.names if self._meter is not None else ()
         self._messages = [NumbersMessage(SHAPE, 1, SHAPE.named(name)) for name in names]
-        self._rebased = rebased_directions(context)
+        self._rebased = rebased_pose(context.model.pose, context.ranges)
         self._unit = NumbersMessage(UNIT, size) if unit else None
         self._limits = [
             (NumbersMessage(LOW, size), self._rebased.low),
@@ -165,14 +164,6 @@ class _Contact:
         for message, gap_mm in zip(self._regions, found.regions.tolist(), strict=True):
             if isfinite(gap_mm):
                 yield message.element(gap_mm)
-
-
-def rebased_directions(context: StreamContext) -> Rebased:
-    """Which raw weights become 0 and 1: the speaker's ranges of `pose_0` ... where there are any, else +- 3 sigma."""
-    mode = context.model.pose
-    usual = Rebased.of_range(mode.mean, mode.sigma, SIGMAS)
-    limits = [context.ranges.get(f"pose_{k}", (usual.low[k], usual.high[k])) for k in range(mode.size)]
-    return Rebased(np.array([low for low, _ in limits]), np.array([high for _, high in limits]))
 
 
 class _Mesh:

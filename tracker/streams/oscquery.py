@@ -43,9 +43,9 @@ from .contact import REGIONS
 from .hosts import is_loopback, names_this_computer
 from .monitor import decode
 from .osc import CoilStatesDatagram, FrameBundle, info_datagrams, numbers_datagram, parse_destination, resolve
-from .osc_more import MoreDatagrams, rebased_directions
+from .osc_more import MoreDatagrams
 from .packing import SEQUENCE_MASK
-from .shapes import shape_names
+from .shapes import rebased_pose, shape_names
 from .sink import LiveNumbers, StreamContext, StreamInfo
 
 DEFAULT_ADDRESS = "127.0.0.1:9002"
@@ -302,7 +302,7 @@ class OscQueryWorker:
                 now_s - self._glb[0] > GLB_PERIOD_S and not np.array_equal(weights, self._glb[1])
             ):
                 model = self._context.model
-                rebased = rebased_directions(self._context)
+                rebased = rebased_pose(model.pose, self._context.ranges)
                 made = glb(model.for_speaker(weights), rebased, model.name, palate=self._context.palate)
                 self._glb = now_s, weights.copy(), made
             return self._glb[2]

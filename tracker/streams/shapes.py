@@ -18,7 +18,7 @@ from math import atan2, degrees, sqrt
 import numpy as np
 
 from ... import InputError
-from ...model.multilinear import TongueModel
+from ...model.multilinear import Mode, TongueModel
 from ...model.rebasing import Rebased
 from ..pose import FloatArray
 from .landmarks import (
@@ -144,8 +144,7 @@ class ShapeMeter:
     @property
     def rebased(self) -> Rebased:
         """The ranges of `pose_0` to `pose_<K-1>`, as everything that re-bases wants them."""
-        low, high = zip(*list(self.ranges.values())[len(SHAPES) :])
-        return Rebased(np.array(low), np.array(high))
+        return rebased_pose(self._landmarks.pose, self.ranges)
 
     def raw(self, speaker_weights: FloatArray, weights: FloatArray) -> FloatArray:
         """(shapes,) what each shape is made of: mm, degrees, or the raw weight."""
@@ -166,6 +165,13 @@ class ShapeMeter:
             (self._landmarks.origin + weights @ self._directions).reshape(-1, 3).tolist()
         )
         return points
+
+
+def rebased_pose(mode: Mode, ranges: Mapping[str, tuple[float, float]]) -> Rebased:
+    """Which raw pose weights become 0 and 1: the ranges of `pose_0` ... where there are any, else +- 3 sigma."""
+    usual = _named(Rebased.of_range(mode.mean, mode.sigma, SIGMAS))
+    low, high = zip(*(ranges.get(name, pair) for name, pair in usual.items()), strict=True)
+    return Rebased(np.array(low), np.array(high))
 
 
 def shape_names(directions: int) -> tuple[str, ...]:

@@ -139,10 +139,7 @@ def scene_of(
     model: TongueModel, session: Session, roles: Sequence[str], correspondences: Sequence[int], title: str
 ) -> Scene:
     """The scene of a session. Raises InputError where a vertex or the speaker is none of the model's."""
-    palate = None
-    if session.palate is not None:
-        back, up = session.palate.curve
-        palate = np.column_stack([np.zeros_like(back), back, up])
+    palate = None if session.palate is None else session.palate.line
     contour = midsagittal_vertices(model)
     return Scene(model, contour, tuple(roles), tuple(correspondences), palate, title, session.speaker_weights)
 
