@@ -183,7 +183,8 @@ def test_the_bite_plane_gives_the_models_frame_to_0_3_mm_and_half_a_degree(calib
 
 
 def everything_at_once(seed, places):
-    """How far `calibrate` puts a speaker of the model from the truth: y or z at the middle in mm, turn in degrees.
+    """How far `calibrate` puts a speaker of the model from the truth: y or z at the middle in mm, turn in degrees; and the
+    largest of y, z and turn in standard deviations that it states.
 
     Eight seconds with a moving head, a mirrored and turned file, a bite plate, a slipping reference, 5 % dropouts and
     0.3 mm of noise. places: role -> mm behind the front end of the mean contour.
@@ -222,16 +223,18 @@ def everything_at_once(seed, places):
     middle = np.median(tongue, axis=(0, 1))
     rest = np.linalg.solve(rotation, middle - translation)
     placed = found.session.alignment.rotation @ rest + found.session.alignment.translation_mm
-    off = np.abs((placed - middle)[1:]).max()
-    return float(off), float(degrees_between(found.session.alignment.rotation, rotation))
+    off = np.abs((placed - middle)[1:])
+    turned = float(degrees_between(found.session.alignment.rotation, rotation))
+    return float(off.max()), turned, float(np.max([*off, turned] / found.registration.sure))
 
 
 def test_four_coils_of_a_speaker_of_the_model_are_placed_to_0_3_mm_and_half_a_degree():
-    """One case, chosen because it holds. Of the seeds 0 to 9 seven do; 1 and 2 end 0.3 to 0.5 mm away and 5 ends 12 mm away,
-    with a note that it is far from its first guess. tests/bench/placement.py measures that."""
-    off_mm, turned_deg = everything_at_once(3, FOUR_COILS)
+    """One case, chosen because it holds. Of the seeds 0 to 9 eight do; 1 and 2 end 0.4 mm away, which is within three of the
+    standard deviations that they state. tests/bench/placement.py measures that."""
+    off_mm, turned_deg, deviations = everything_at_once(3, FOUR_COILS)
     assert off_mm < 0.3
     assert turned_deg < 0.5
+    assert deviations < 3.0
 
 
 def test_the_fit_to_the_model_stays_within_what_it_says_of_itself(calibrated):

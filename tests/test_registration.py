@@ -10,7 +10,7 @@ from tonguetrack import InputError
 from tonguetrack.model.midsagittal import midsagittal_vertices
 from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.palate import curve_palate
-from tonguetrack.tracker.registration import FirstGuess, _Posterior, fit_alignment, handedness
+from tonguetrack.tracker.registration import FirstGuess, _believable, _Posterior, fit_alignment, handedness
 from tonguetrack.tracker.session import Energy
 from tonguetrack.tracker.simulation import Simulation, simulate
 
@@ -110,6 +110,37 @@ def test_four_coils_of_any_speaker_of_the_model_place_themselves_to_0_3_mm_and_h
     assert found.vertices == tuple(vertices)
 
 
+def test_two_neighbouring_coils_with_wrong_vertices_slide_back_together(model):
+    """Neither alone would go: 12 mm beside the truth was the end of a fit that could not move both."""
+    coils, vertices, _ = spoken(model, 5)
+    posterior = _Posterior(model, coils, (*ROLES, "tongue_back"), NEAR, None, True)
+    true = tuple(list(posterior.candidates).index(vertex) for vertex in vertices)
+    posterior.noise_mm = 0.4
+    wrong = (*true[:2], true[2] + 1, true[3] + 1)
+    unknowns, _ = posterior._descend(posterior.begin(wrong), wrong)
+    assert posterior._slid(unknowns, wrong)[2:] == true[2:]
+
+
+def test_frames_whose_noise_repeats_count_once(model):
+    coils, vertices = coils_of(model, 3, frames=200)
+    for repeated in (1, 8):
+        longer = np.repeat(coils, repeated, axis=0)
+        posterior = _Posterior(model, longer, ROLES, NEAR, None, True)
+        places = tuple(list(posterior.candidates).index(vertex) for vertex in vertices)
+        unknowns = posterior.begin(places)
+        for _ in range(6):
+            unknowns, _ = posterior._descend(unknowns, places)
+            posterior._adapt(unknowns, places, 0.1)
+        assert 100 < posterior._residuals_seen <= 220
+
+
+def test_a_fit_that_contradicts_its_first_guess_is_not_stated_to_be_sure():
+    """12.3 mm from a bite plane that is good to 3 mm, found to 0.2 mm: then it is good to 4.1 mm."""
+    sure, guess = np.array([0.2, 0.1, 0.1]), np.array([3.0, 3.0, 4.0])
+    assert _believable(sure, guess, np.array([-4.1, 0.4, 0.3])) == pytest.approx(guess * 4.1 / 3.0)
+    assert _believable(sure, guess, np.array([-2.9, 0.4, 0.3])) == pytest.approx(sure)
+
+
 @pytest.mark.parametrize("seed", [1, 6])
 def test_three_coils_of_a_speaker_of_the_model_are_as_far_off_as_they_are_said_to_be(model, seed):
     """They leave some tenths of a millimetre open, and one has to be told so: 3 standard deviations at most."""
@@ -117,7 +148,7 @@ def test_three_coils_of_a_speaker_of_the_model_are_as_far_off_as_they_are_said_t
     moved, rotation, _ = displaced(coils, -2.0, 2.0, -3.0)
     found = fit_alignment(model, moved, ROLES, NEAR, Energy())
     assert np.all(errors(found, moved, coils, rotation) < 3.0 * found.sure)
-    assert found.sure.max() < 0.6
+    assert found.sure.max() < 0.9
 
 
 def test_a_tongue_that_never_moves_says_little_however_long_it_is_recorded(model):

@@ -21,7 +21,8 @@ The poses are integrated out: D(s) = d v / d p at the coils, sigma_s and Sigma_p
 weights. (With the best pose instead, a larger speaker who moves less would win, however exact the coils.) The frames
 enter by their mean and covariance alone, which is why this is fast. What parts coils and vertices is mostly what the
 model cannot express, and that is the same in every frame: T frames say no more than N = T / (1 + (T - 1) r)
-independent ones, where r is the share of the noise that is not the device's own. How usual the poses are is told by
+independent ones, where r is the share of the noise that is not the device's own, and T is as many as the residuals'
+autocorrelation leaves (smoothing, and what is left of the head's motion, make neighbours alike). How usual the poses are is told by
 fewer still, P, for neighbouring frames show the same pose: reckoned alike, from as many frames as their
 autocorrelation leaves. The noise is estimated from the residuals, so coils that the model can express place themselves
 to a fraction of a millimetre, and those of a stranger stay near their bite plane. Scale is not fitted.
@@ -31,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +73,10 @@ FULL_STEPS, TRIAL_STEPS = 60, 12  # of a descent; of one that only compares plac
 UNITS = (2.0, 0.05)  # mm and radians of one step of the search
 CURVATURE_STEP = 0.02  # in units of the search: less than the kinks of the palate, more than rounding
 FAR_FROM_GUESS = 2.5  # standard deviations
+CONTRADICTION = 3.0  # standard deviations from the guess; a fit farther away is not believed to be sure
+# How noise is shared between coils (what is left of the head's motion is in all of them) is known no better than from
+# so many frames, though J takes it for independent; for how sure the motion is.
+SURE_FRAMES = 50
 
 
 @dataclass(frozen=True)
@@ -107,7 +112,8 @@ class Registration:
     speaker_weights: (m,) raw, the joint estimate over the sampled frames with the tracker's energy.
     residual_before_mm, residual_mm: mean distance of coils from vertices for that estimate, at the first guess and
     now, with the same vertices. sure: (3,) for mid-sagittal coils: sd of y, z in mm and of the pitch in degrees; else
-    (6,): of x, y, z in mm and of the rotations about x, y, z in degrees; from the curvature of J.
+    (6,): of x, y, z in mm and of the rotations about x, y, z in degrees; from the curvature of J with N at most
+    SURE_FRAMES, and no less than its contradiction of the guess asks for.
     posterior: J. noise_mm: what it took for the model's misfit. palate_margin_mm: by how much the contour is above
     the palate in the highest 1 % of the sampled frames (negative: below); NaN without a palate.
     sentences: for people.
@@ -190,7 +196,11 @@ def fit_alignment(
     """
     frames = np.asarray(coils[complete_frames(coils)], dtype=np.float64)
     posterior, found = _settled(lambda: _Posterior(model, frames, roles, guess, palate, midsagittal))
-    sure = posterior.standard_deviations(found)
+    sure = _believable(
+        posterior.standard_deviations(found),
+        posterior.guess_deviations(),
+        posterior.deviations_from_guess(found.unknowns),
+    )
 
     vertices = tuple(int(posterior.candidates[place]) for place in found.places)
     at_coils = model.at(vertices)
@@ -337,12 +347,12 @@ class _Posterior:
         self.noise_mm = MODEL_NOISE_MM
         self._at_places: dict[Places, tuple[FloatArray, FloatArray]] = {}
         self._poses_seen = _poses_seen(self._coils.reshape(len(self._coils), -1)[:, self._axes])
+        self._residuals_seen = float(len(self._coils))
         self._summarise(_near_their_medians(self._coils))
 
     def _summarise(self, kept: NDArray[np.bool_]) -> None:
         """The frames that count, as their mean (3n,) and covariance (3n, 3n), and some of them for the palate."""
         flat = self._coils[kept].reshape(int(kept.sum()), -1)
-        self._frames = len(flat)
         self._middle_of_frames = flat.mean(axis=0)
         self._spread = np.cov(flat.T, bias=True) if len(flat) > 1 else np.zeros((flat.shape[1],) * 2)
         self.shown = _evenly(flat.reshape(len(flat), -1, 3), SHOWN_FRAMES)
@@ -416,9 +426,13 @@ class _Posterior:
 
     # J ----------------------------------------------------------------------------------------------
 
+    def _counts(self) -> tuple[float, float]:
+        """P and N."""
+        poses = self._independent(self._poses_seen)
+        return poses, max(poses, self._independent(min(self._residuals_seen, MOST_INDEPENDENT)))
+
     def _independent(self, frames: float) -> float:
-        """How many independent frames so many are worth: N for those of the recording, P for the poses seen."""
-        frames = min(frames, MOST_INDEPENDENT)
+        """How many independent frames so many are worth whose device noise is new in each."""
         repeated = 1.0 - min(DEVICE_NOISE_MM / self.noise_mm, 1.0) ** 2
         return frames / (1.0 + (frames - 1) * repeated)
 
@@ -436,7 +450,7 @@ class _Posterior:
     def _value(self, unknowns: FloatArray, places: Places) -> tuple[float, FrameTerms, Term | None]:
         """J; of it, the frames' terms and the palate's."""
         frame = self._frame_terms(unknowns, places, self.noise_mm)
-        poses, frames = self._independent(self._poses_seen), self._independent(self._frames)
+        poses, frames = self._counts()
         value = poses * frame.whole.value + (frames - poses) * frame.beside.value
         value += 0.5 * float(unknowns[self.size :] @ unknowns[self.size :])
         away = unknowns[: self.size] / self._sd
@@ -459,7 +473,7 @@ class _Posterior:
     def _value_and_slope(self, unknowns: FloatArray, places: Places) -> tuple[float, FloatArray]:
         """J and its derivatives (k,)."""
         value, frame, bound = self._value(unknowns, places)
-        poses, frames = self._independent(self._poses_seen), self._independent(self._frames)
+        poses, frames = self._counts()
         speaker_slope, by_motion = (
             poses * whole + (frames - poses) * beside
             for whole, beside in zip(frame.whole[1:], frame.beside[1:], strict=True)
@@ -558,7 +572,9 @@ class _Posterior:
         cost = self._cost_of_places(unknowns, places, TRIAL_STEPS)
         places = slid_along_contour(places, self._middle, self._contour_size, cost)
         for stride in (4, 2, 1, 1):
-            together = (self._all_slid(places, move) for move in (-stride, stride))
+            together = (
+                self._moved_places(places, moves) for moves in _neighbours_moved(len(self._middle), stride)
+            )
             places = min((places, *(one for one in together if one is not None)), key=cost)
         for index in self._lateral:
             trials = [places]
@@ -596,10 +612,6 @@ class _Posterior:
             return known[trial]
 
         return cost
-
-    def _all_slid(self, places: Places, move: int) -> Places | None:
-        """All mid-sagittal coils together, as a wrong motion along the tongue has them; None beyond the contour."""
-        return self._moved_places(places, [move] * len(self._middle))
 
     def _moved_places(self, places: Places, moves: Sequence[int]) -> Places | None:
         """Each mid-sagittal coil slid by its move, the lateral ones taken along; None where that is no order."""
@@ -642,6 +654,8 @@ class _Posterior:
         poses = self._pose_mean + off[kept] @ frame.gain.T
         unsure = self._pose_covariance - frame.gain @ frame.directions.T @ self._pose_covariance
         mean = (1.0 - own) * training.mean + own * poses.mean(axis=0)
+        left = off[kept] - (poses - self._pose_mean) @ frame.directions
+        self._residuals_seen = float(np.median(effective_frames(left)))
         away = poses - mean
         believed = np.diag(_measured_sigma(training) ** 2) + np.outer(
             training.mean - mean, training.mean - mean
@@ -672,9 +686,17 @@ class _Posterior:
 
     def standard_deviations(self, found: _Found) -> FloatArray:
         """(3,) or (6,) of the motion, mm and degrees; the speaker is not held."""
+        seen, self._residuals_seen = self._residuals_seen, min(self._residuals_seen, SURE_FRAMES)
         deviations = np.sqrt(np.diag(self._covariance(found.unknowns, found.places)))[: self.size]
-        deviations[self._shifts :] = np.degrees(deviations[self._shifts :])
-        return np.asarray(deviations)
+        self._residuals_seen = seen
+        return self._in_degrees(deviations)
+
+    def guess_deviations(self) -> FloatArray:
+        """(3,) or (6,) how far the guess may be wrong, mm and degrees."""
+        return self._in_degrees(self._sd)
+
+    def _in_degrees(self, motion: FloatArray) -> FloatArray:
+        return np.concatenate([motion[: self._shifts], np.degrees(motion[self._shifts :])])
 
     def deviations_from_guess(self, unknowns: FloatArray) -> FloatArray:
         """The motion in standard deviations of the guess."""
@@ -691,6 +713,24 @@ def _shapes(model: TongueModel, speaker: FloatArray, poses: FloatArray) -> Float
     """(T, V, 3) mm: the model's vertices for one speaker (m,) in the poses (T, n)."""
     directions = np.tensordot(speaker, model.core, axes=1)
     return np.asarray((model.origin + poses @ directions).reshape(len(poses), -1, 3))
+
+
+def _believable(sure: FloatArray, guess_sd: FloatArray, away: FloatArray) -> FloatArray:
+    """The standard deviations of a fit, in the units of those of its guess; away: from the guess, in the latter. A fit
+    that contradicts its guess is stated so unsure that it is within CONTRADICTION of it."""
+    worst = float(np.abs(away).max())
+    return sure if worst <= CONTRADICTION else np.maximum(sure, guess_sd * worst / CONTRADICTION)
+
+
+def _neighbours_moved(coils: int, stride: int) -> list[list[int]]:
+    """The moves that slide two or more neighbouring coils together, by the stride: all of them follow a wrong motion
+    along the tongue, some of them a wrong speaker."""
+    found = []
+    for first, last in combinations(range(coils + 1), 2):
+        if last - first > 1:
+            inside = [int(first <= coil < last) for coil in range(coils)]
+            found += [[sign * stride * one for one in inside] for sign in (-1, 1)]
+    return found
 
 
 def _poses_seen(series: FloatArray) -> float:
@@ -734,7 +774,12 @@ def _sentences(
         f"correspondences (fitted with the alignment): {found.correspondences}",
     ]
     worst = float(np.abs(posterior.deviations_from_guess(motion)).max())
-    if worst > FAR_FROM_GUESS:
+    if worst > CONTRADICTION:
+        told.append(
+            f"note: the fit contradicts {guess.source} by {worst:.1f} standard deviations, so its own are stated as no "
+            f"less than {worst / CONTRADICTION:.1f} times those of that; look at the contours before it is believed"
+        )
+    elif worst > FAR_FROM_GUESS:
         told.append(
             f"note: the fit is {worst:.1f} standard deviations away from {guess.source}; look at the contours before "
             "it is believed"
