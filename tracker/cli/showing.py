@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from ...model.multilinear import TongueModel
     from ..pose import TrackedPoses
     from ..session import Session
+    from ..viewer.film import Picture, Shot
     from ..viewer.look import Look
     from ..viewer.playback import Ghost
     from ..viewer.scene import Moments, Scene
@@ -157,3 +159,15 @@ def _split(text: str) -> tuple[str, float | None]:
         return path, float(seconds)
     except ValueError:
         return text, None
+
+
+def with_progress(shot: Shot, title: str = "drawing") -> Iterable[Picture]:
+    """The pictures, with a progress bar where there is a person to see it."""
+    if not sys.stderr.isatty():
+        return shot.pictures()
+    from rich.console import Console
+    from rich.progress import track as progress
+
+    return progress(
+        shot.pictures(), description=title, total=shot.picture_count, console=Console(stderr=True)
+    )

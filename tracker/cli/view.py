@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ... import InputError
 from .names import keep_apart, prepare_folder
-from .showing import add_show_flags, shown
+from .showing import add_show_flags, shown, with_progress
 
 if TYPE_CHECKING:
     from ..viewer.film import Shot
@@ -88,14 +87,14 @@ def run_render(args: argparse.Namespace) -> int:
         target, kind = target.with_suffix(".png"), ".png"
     if kind == ".mp4":
         audio = Path(args.audio) if args.audio else None
-        write_film(_with_progress(shot), target, shot.fps, shot.begin_s, shot.size, audio)
+        write_film(with_progress(shot), target, shot.fps, shot.begin_s, shot.size, audio)
     elif kind != ".png":
         check_animation(shot)
-        write_animation(_with_progress(shot), target, shot.fps)
+        write_animation(with_progress(shot), target, shot.fps)
     if kind != ".png":
         print(f"written: {target} ({_what(shot)}, {shot.picture_count} pictures)", file=sys.stderr)
     else:
-        write_pictures(_with_progress(shot), target)
+        write_pictures(with_progress(shot), target)
         print(f"written: {shot.picture_count} pictures beside {target} ({_what(shot)})", file=sys.stderr)
     return 0
 
@@ -149,16 +148,4 @@ def _without_video(args: argparse.Namespace, target: Path, shot: Shot) -> str:
         "a film needs the extra 'video': pip install 'tonguetrack[video]'. Pictures are written instead; ffmpeg makes a "
         f"film of them: ffmpeg -framerate {shot.fps:g} -i {target.with_suffix('')}_%06d.png{sound} "
         f"-pix_fmt yuv420p {target}"
-    )
-
-
-def _with_progress(shot: Shot) -> Iterable[Any]:
-    """The pictures, with a progress bar where there is a person to see it."""
-    if not sys.stderr.isatty():
-        return shot.pictures()
-    from rich.console import Console
-    from rich.progress import track as progress
-
-    return progress(
-        shot.pictures(), description="drawing", total=shot.picture_count, console=Console(stderr=True)
     )
