@@ -3,9 +3,10 @@
 # tests/test_bundled.py runs the same commands and compares.
 set -eu
 
-# Twelve seconds of phones, three coils on the tongue: what `tonguetrack demo` plays.
-tonguetrack simulate recording demo.csv --seconds 12 --phones "ə i ə ɑ ə u ə s a ʃ i ɔ ʉ ɛ s o"
-tonguetrack track demo.csv --save-session demo.session.toml
+# Twelve seconds of phones, three coils on the tongue, and the palate: what `tonguetrack demo` plays.
+tonguetrack simulate recording demo.csv --seconds 12 --phones "ə i ə ɑ ə u ə s a ʃ i ɔ ʉ ɛ s o" \
+    --palate demo.palate.csv
+tonguetrack track demo.csv --palate demo.palate.csv --save-session demo.session.toml
 
 # Another speaker, five coils, and every coil lost 5 % of the time.
 tonguetrack simulate recording dropouts.csv --speaker 2 --seconds 4 --dropouts 0.05 \

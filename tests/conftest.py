@@ -1,7 +1,11 @@
 """Fixtures for all tests."""
 
 import os
+import sys
 from pathlib import Path
+
+# What stands beside the tests and is none: decoders, fixtures.
+sys.path.append(str(Path(__file__).parent))
 
 # Several workers on few cores: the linear algebra library's own threads only get in each other's way.
 for _library in ("OPENBLAS", "OMP", "MKL"):

@@ -98,7 +98,9 @@ CORE = tuple(
     name
     for name in SOURCES
     if within(name, "tonguetrack.tracker")
-    and not within(name, "tonguetrack.tracker.cli", "tonguetrack.tracker.streams")
+    and not within(
+        name, "tonguetrack.tracker.cli", "tonguetrack.tracker.streams", "tonguetrack.tracker.viewer"
+    )
 )
 
 
@@ -145,8 +147,11 @@ def test_the_trackers_core_never_imports_the_command_line():
     )
 
 
-def test_streams_know_of_the_tracker_only_its_poses_and_what_can_be_asked_of_it():
-    allowed = tuple(f"tonguetrack.tracker.{name}" for name in ("pose", "latency", "control", "streams"))
+def test_streams_know_models_and_poses_but_not_how_poses_are_made():
+    """The page's server runs in a process of its own, where it has to load the model and the session itself."""
+    allowed = ["tonguetrack.model"]
+    allowed += [f"tonguetrack.tracker.{name}" for name in ("pose", "latency", "control", "streams", "gltf")]
+    for_the_page = [f"tonguetrack.tracker.{name}" for name in ("bundled", "session")]
     offences(
         [
             f"{source.path}:{found.line} imports {found.module}"
@@ -154,6 +159,20 @@ def test_streams_know_of_the_tracker_only_its_poses_and_what_can_be_asked_of_it(
             if within(source.name, "tonguetrack.tracker.streams")
             for found in source.imports
             if not within(found.module, *allowed) and found.module not in ROOT_MODULES
+            if not (within(source.name, "tonguetrack.tracker.streams.page") and found.module in for_the_page)
+        ]
+    )
+
+
+def test_the_viewer_knows_nothing_of_how_poses_are_made():
+    solving = ("kernels", "solver", "online", "tracking", "live", "guard", "preparation", "setup", "cli")
+    offences(
+        [
+            f"{source.path}:{found.line} imports {found.module}"
+            for source in SOURCES.values()
+            if within(source.name, "tonguetrack.tracker.viewer")
+            for found in source.imports
+            if within(found.module, *(f"tonguetrack.tracker.{name}" for name in solving))
         ]
     )
 
@@ -167,7 +186,12 @@ def test_only_the_live_loop_its_status_and_its_measurement_know_of_streams():
             for name in CORE
             if name not in loop
             for found in SOURCES[name].imports
-            if within(found.module, "tonguetrack.tracker.streams", "tonguetrack.tracker.live")
+            if within(
+                found.module,
+                "tonguetrack.tracker.streams",
+                "tonguetrack.tracker.live",
+                "tonguetrack.tracker.viewer",
+            )
         ]
     )
 

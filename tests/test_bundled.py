@@ -1,5 +1,6 @@
 """What ships in the package: made by the commands that lie beside it, and synthetic wherever it is named."""
 
+import json
 import subprocess
 import sys
 from importlib.resources import files
@@ -11,6 +12,9 @@ import pytest
 from tonguetrack.drivers import open_recording
 from tonguetrack.model.files import load_model
 from tonguetrack.tracker.bundled import bundled_model, bundled_recording
+from tonguetrack.tracker.calibration import contours
+from tonguetrack.tracker.session import load_session
+from tonguetrack.tracker.tracking import track_recording
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -50,7 +54,11 @@ def test_the_sample_recordings_are_what_their_script_makes(tmp_path):
         new, shipped = open_recording(made / name), open_recording(ROOT / "recordings" / name)
         assert new.coils == shipped.coils
         np.testing.assert_allclose(new.positions, shipped.positions, atol=2e-3)
-    assert (made / "demo.session.toml").is_file()
+    new, shipped = (
+        load_session(folder / "demo.session.toml").palate for folder in (made, ROOT / "recordings")
+    )
+    assert (made / "demo.palate.csv").read_text() == (ROOT / "recordings" / "demo.palate.csv").read_text()
+    np.testing.assert_array_equal(new.points_mm, shipped.points_mm)
 
 
 def test_the_bundled_model_says_that_it_is_synthetic():
@@ -70,6 +78,21 @@ def test_the_demo_has_a_complete_session():
     assert set(session.correspondences) == {"tongue_tip", "tongue_blade", "tongue_dorsum"}
     assert recording.rate_hz == 250
     assert "Synthetic" in recording.notes[0]
+
+
+def test_the_demos_palate_bounds_its_tongue_and_is_nearly_touched_where_speech_does():
+    recording, session = bundled_recording()
+    model = bundled_model()
+    poses = track_recording(recording, model, session, (2,)).experiment_2
+    with np.load(ROOT / "recordings" / "demo.truth.npz") as truth:
+        starts = truth["phone_times_s"]
+        phones = json.loads(truth["words"].tobytes())["phones"]
+    highest = np.nanmax(session.palate.above(contours(poses, model)), axis=1)
+    assert highest.max() < 1.0
+    for phone, low, high in (("s", -3.5, 0.5), ("i", -3.5, 0.5), ("a", -25.0, -12.0)):
+        held = [start + 0.18 for start, one in zip(starts, phones, strict=False) if one == phone]
+        frames = [round(t * recording.rate_hz) for t in held if t < recording.duration_s]
+        assert frames and low < highest[frames].min() and highest[frames].max() < high
 
 
 @pytest.mark.parametrize("name", ["default.npz"])

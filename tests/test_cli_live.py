@@ -270,7 +270,7 @@ def test_one_message_with_other_arguments_does_not_hide_the_stream(capsys):
     monitor = Heard()
     monitor.frame(0)
     monitor.hear("/tongue/frame", 7)
-    so_far = _report(monitor, 0, 0)
+    so_far = _report(monitor, 0, 0, 0)
     assert "frame 0 ok  sigma +0.50" in (told := capsys.readouterr().err)
     assert "1 messages with other arguments" in told
     monitor.frame(1)
@@ -339,6 +339,6 @@ def test_parsers_of_the_three_commands_stand_alone():
     commands = parser.add_subparsers(required=True)
     for family in (demo, monitor, bench):
         family.add_commands(commands)
-    assert parser.parse_args(["demo", "--fast"]).osc == "127.0.0.1:9000"
+    assert parser.parse_args(["demo", "--fast"]).fast
     assert parser.parse_args(["monitor"]).listen == "127.0.0.1:9000"
     assert parser.parse_args(["bench"]).model is None

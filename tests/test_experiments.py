@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from displays import require_egl
 
 from tonguetrack import InputError
 from tonguetrack.drivers import write_recording
@@ -18,7 +19,6 @@ from tonguetrack.tracker.cli.experiment import short_names
 from tonguetrack.tracker.experimentplots import PICTURE_FILES, draw_errors, draw_weights, pictures
 from tonguetrack.tracker.experimentreport import (
     ALL,
-    NO_FILMS,
     TABLE_FILES,
     all_statistics,
     as_csv,
@@ -194,7 +194,6 @@ def test_the_csv_and_the_json_hold_the_same_numbers(done):
                 for name, spread in figures[group].items():
                     for statistic, value in spread.items():
                         assert rows[*key, name, statistic] == pytest.approx(value, rel=1e-8)
-    assert content["films"] == NO_FILMS
 
 
 def test_the_text_table_has_one_row_a_recording_and_experiment(done):
@@ -264,10 +263,33 @@ def test_the_command_writes_the_whole_folder(place, tmp_path, capsys):
     written = {path.name for path in (tmp_path / "report").iterdir()}
     assert written == {*TABLE_FILES, *PICTURE_FILES, *features}
     page = (tmp_path / "report" / "report.md").read_text(encoding="utf-8")
-    for expected in (NO_FILMS, "random test model", "(errors.png)", "(weights.png)", "| pose 4 |", *features):
+    for expected in ("random test model", "(errors.png)", "(weights.png)", "| pose 4 |", *features):
         assert expected in page
     out = capsys.readouterr().out.splitlines()
-    assert len(out) == 8 and out[-1] == NO_FILMS
+    assert len(out) == 7
+
+
+def test_films_show_every_recording_in_both_experiments(place, tmp_path):
+    pytest.importorskip("matplotlib")
+    av = pytest.importorskip("av")
+    require_egl()
+    assert run(place, tmp_path, "--films") == 0
+    page = (tmp_path / "report.md").read_text(encoding="utf-8")
+    for name, number in ((name, number) for name in ("one", "two") for number in (1, 2)):
+        film = f"film_{name}_experiment_{number}.mp4"
+        assert f"({film})" in page
+        with av.open(tmp_path / film) as opened:
+            frames = [frame.to_ndarray(format="rgb24") for frame in opened.decode(video=0)]
+        assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50  # it moves
+
+
+def test_films_that_cannot_be_made_are_refused_before_the_work(place, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("matplotlib")
+    require_egl()
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert run(place, tmp_path / "report", "--films") == 2
+    assert "the extra 'video'" in capsys.readouterr().err
+    assert not (tmp_path / "report").exists()
 
 
 def test_json_alone_is_on_stdout_when_asked_for(place, tmp_path, capsys):

@@ -10,9 +10,12 @@ from pythonosc.osc_message_builder import OscMessageBuilder
 
 from tonguetrack.tracker.pose import PoseStatus, TrackedPose
 from tonguetrack.tracker.streams import monitor as module
+from tonguetrack.tracker.streams import vocabularies
 from tonguetrack.tracker.streams.monitor import Monitor, Stream, decode
 from tonguetrack.tracker.streams.osc import FrameBundle, info_datagrams
+from tonguetrack.tracker.streams.presets import load_preset
 from tonguetrack.tracker.streams.sink import StreamInfo
+from tonguetrack.tracker.streams.vocabularies import preset_vocabularies
 
 HERE = ("127.0.0.1", 50000)
 MS = 1_000_000
@@ -120,9 +123,9 @@ def test_starts_and_info_and_strangers_are_told_once():
 
 def test_unknown_addresses_are_named_and_counted():
     monitor = heard(
-        [message("/VMC/Ext/OK", 1), message("/tongue/posse", 1.0), message("/tongue/pose/x", 1.0)] * 2
+        [message("/stranger", 1), message("/tongue/posse", 1.0), message("/tongue/pose/x", 1.0)] * 2
     )
-    assert monitor.as_dict()["unknown"] == {"/VMC/Ext/OK": 2, "/tongue/pose/x": 2, "/tongue/posse": 2}
+    assert monitor.as_dict()["unknown"] == {"/stranger": 2, "/tongue/pose/x": 2, "/tongue/posse": 2}
     assert "/tongue/posse: 2" in str(monitor)
 
 
@@ -274,3 +277,96 @@ def test_numbers_that_are_none_are_shown_as_such():
     monitor = heard([message("/tongue/quality", float("nan"), 3, float("inf"))])
     assert monitor.as_dict()["addresses"]["/tongue/quality"]["last"] == [None, 3, None]
     assert monitor.latency_ns.count == 0
+
+
+# Names ----------------------------------------------------------------------------------------------
+
+
+def named(*messages_of):
+    """A monitor that knows the presets, after these messages; and what it told."""
+    told = []
+    monitor = Monitor(told.append, preset_vocabularies())
+    for k, datagram in enumerate(messages_of):
+        monitor.receive(datagram, HERE, k * MS)
+    json.dumps(monitor.as_dict(), allow_nan=False)
+    return monitor, told
+
+
+def blend(name, value=0.5):
+    return message("/VMC/Ext/Blend/Val", name, value)
+
+
+def test_blend_shapes_of_a_preset_are_all_there_or_the_missing_ones_are_named():
+    names = [target.name for target in load_preset("a2f16").targets]
+    monitor, told = named(*map(blend, names))
+    assert (monitor.named.preset, monitor.named.missing, monitor.named.unknown) == ("a2f16", [], [])
+    assert f"names      {len(names)}; preset a2f16: all of its names" in str(monitor)
+    assert told == []
+    monitor, _ = named(*map(blend, names[2:]))
+    assert f"preset a2f16: missing {', '.join(sorted(names[:2]))}" in str(monitor)
+
+
+def test_avatar_parameters_are_known_under_both_prefixes():
+    paths = ["/avatar/parameters/v2/TongueOut", "/avatar/parameters/FT/v2/TongueX"]
+    monitor, told = named(*(message(path, 0.25) for path in paths))
+    assert monitor.as_dict()["names"]["counts"] == {"TongueOut": 1, "TongueX": 1}
+    assert "TongueX  1  0.250" in str(monitor)
+    assert monitor.unknown == {} and told == []
+
+
+def test_a_name_in_no_preset_is_told_once_and_one_with_other_capitals_with_what_is_meant():
+    monitor, told = named(*[blend("tongueout"), blend("Smile")] * 3)
+    assert [sentence.partition(": ")[2] for sentence in told] == [
+        "the name tongueout is in no preset; is tongueOut of the preset arkit meant? Capitals count",
+        "the name Smile is in no preset",
+    ]
+    assert "names      unknown: tongueout, Smile" in str(monitor)
+
+
+def test_the_models_own_directions_are_names_of_ours_however_many():
+    monitor, told = named(blend("tip_up"), blend("pose_0"), blend("pose_12"))
+    assert told == [] and monitor.named.preset == "own"
+
+
+def test_every_address_of_vmc_and_vrchat_is_known_with_its_arguments():
+    monitor, _ = named(
+        message("/VMC/Ext/OK", 1, 3, 0, 1), message("/VMC/Ext/T", 0.5), blend("tongueOut"),
+        message("/VMC/Ext/Blend/Apply"), message("/avatar/parameters/LipTrackingActive", True),
+        message("/avatar/parameters/ExpressionTrackingActive", False), message("/avatar/parameters/v2/TongueX", -0.5),
+    )  # fmt: skip
+    addresses = monitor.as_dict()["addresses"]
+    assert len(addresses) == 7 and not monitor.unknown
+    assert all(seen["misfits"] == 0 for seen in addresses.values())
+    monitor, _ = named(message("/avatar/parameters/LipTrackingActive", 1))
+    assert monitor.seen["/avatar/parameters/LipTrackingActive"].misfits == 1
+
+
+def test_what_is_sent_where_asked_for_is_known():
+    blob = bytes(range(12))
+    monitor, _ = named(
+        message("/tongue/extra", 0, 1, 0.5), message("/tongue/coil/tongue_tip", 1.0, 2.0, 3.0),
+        message("/tongue/shape/tip_up", 0.5), message("/tongue/mesh", 0, 0, 1, 0, 0.0025, blob),
+    )  # fmt: skip
+    assert not monitor.unknown
+    assert all(seen.misfits == 0 for seen in monitor.seen.values())
+    assert monitor.as_dict()["addresses"]["/tongue/mesh"]["last"][-1] == "12 bytes"
+
+
+def test_names_and_the_addresses_that_hold_them_are_bounded():
+    monitor, told = named(
+        *(blend(f"name{k}") for k in range(2000)),
+        *(message(f"/tongue/shape/name{k}", 0.5) for k in range(2000)),
+        *(message(f"/avatar/parameters/other{k}", 0.5) for k in range(2000)),
+    )
+    assert len(monitor.seen) == module.MAX_SEEN and monitor.seen_beyond > 0
+    assert len(monitor.named.counts) == vocabularies.MAX_NAMES
+    assert len(told) <= module.MAX_NOTICES
+    assert "further addresses: " in str(monitor)
+
+
+def test_foreign_names_cannot_command_the_terminal():
+    monitor, told = named(
+        blend("\x1b[2Jevil" + "x" * 500), message("/VMC/Ext/Blend/Val", "nan", float("nan"))
+    )
+    assert all("\x1b" not in text for text in (*told, str(monitor)))
+    assert monitor.as_dict()["names"]["last"]["nan"] is None

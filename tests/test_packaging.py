@@ -105,11 +105,19 @@ def test_the_wheel_holds_our_package_and_nothing_beside_it(built):
     assert not [name for name in names if name.endswith((".pyc", ".nbi", ".nbc", ".orig", "~"))]
 
 
+PACKAGES_WITH_DATA = (
+    "tonguetrack.model.data",
+    "tonguetrack.recordings",
+    "tonguetrack.tracker.streams.page",
+    "tonguetrack.tracker.streams.presets",
+)
+
+
 def test_the_wheel_holds_every_module_and_data_file_of_the_tree(built):
     expected = {"tonguetrack/py.typed"}
     for package, folder in FOLDERS.items():
         place = package.replace(".", "/")
-        data = package in ("tonguetrack.model.data", "tonguetrack.recordings")
+        data = package in PACKAGES_WITH_DATA
         expected |= {
             f"{place}/{file.name}"
             for file in (ROOT / folder).iterdir()
@@ -117,7 +125,12 @@ def test_the_wheel_holds_every_module_and_data_file_of_the_tree(built):
         }
     names = {name for name in contents(wheel_of(built)) if name.startswith("tonguetrack/")}
     assert names == expected
-    assert {"tonguetrack/model/data/default.npz", "tonguetrack/recordings/demo.csv"} <= names
+    assert {
+        "tonguetrack/model/data/default.npz",
+        "tonguetrack/recordings/demo.csv",
+        "tonguetrack/tracker/streams/page/three.bundle.js",
+        "tonguetrack/tracker/streams/presets/arkit.toml",
+    } <= names
 
 
 def test_the_wheel_is_small(built):

@@ -20,7 +20,12 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-SAMPLES = ("recordings/demo.csv", "recordings/demo.session.toml", "model/data/default.npz")
+SAMPLES = (
+    "recordings/demo.csv",
+    "recordings/demo.palate.csv",
+    "recordings/demo.session.toml",
+    "model/data/default.npz",
+)
 
 BY_CI = "by .ci/run, word for word"
 HERE = "here, in a folder of its own, in the order of the page"
@@ -30,6 +35,10 @@ ELSEWHERE = "by another test: "
 WAVE = ".venv/bin/tonguetrack live rtc3d://192.168.0.10"
 FIRST_TAKE = ".venv/bin/tonguetrack live simulate: --seconds 5 --record first.xdf"
 SIMULATED = ".venv/bin/tonguetrack simulate device "
+TRACK_DEMO = ".venv/bin/tonguetrack track recordings/demo.csv --session recordings/demo.session.toml"
+RENDER_DEMO = ".venv/bin/tonguetrack render demo.poses.csv --session recordings/demo.session.toml"
+DEMO = ".venv/bin/tonguetrack demo --seconds 5 --to "
+WITHOUT_END = ELSEWHERE + "test_window.py and test_page_browser.py, and .ci/run for some seconds"
 BY_FAULTS = ELSEWHERE + "test_cli_live_devices.py and the simulators' own tests: it runs until it is ended"
 
 README = {
@@ -60,6 +69,18 @@ README = {
     FIRST_TAKE: HERE,
     ".venv/bin/tonguetrack take info first.xdf --check": HERE,
     ".venv/bin/tonguetrack bench": ELSEWHERE + "test_bench.py, with smaller numbers",
+    ".venv/bin/pip install '.[viewer,web,video]'": BY_CI,
+    "sudo apt-get install -y libegl1 libgl1 libgl1-mesa-dri xvfb xauth chromium": BY_CI,
+    ".venv/bin/tonguetrack demo --view": WITHOUT_END,
+    ".venv/bin/tonguetrack demo --web": WITHOUT_END,
+    TRACK_DEMO + " --out demo.poses.csv": HERE,
+    RENDER_DEMO + " --seconds 2.4:6 --size 896x504 --fps 15 -o tongue.webp": HERE,
+    RENDER_DEMO + " --frame 300 -o tongue.png": HERE,
+    ".venv/bin/tonguetrack export poses.csv -o tongue.glb": HERE,
+    (
+        ".venv/bin/tonguetrack demo --seconds 5 --to 'vmc://127.0.0.1:39540?preset=unified' "
+        "--to 'osc://127.0.0.1:9000?send=shapes'"
+    ): HERE,
 }
 
 DOCS = {
@@ -74,6 +95,29 @@ DOCS = {
     FIRST_TAKE: HERE,
     ".venv/bin/tonguetrack doctor": ELSEWHERE + "test_doctor.py, where what is found may be anything",
     ".venv/bin/tonguetrack devices": HERE,
+    ".venv/bin/pip install '.[viewer]'": BY_CI,
+    ".venv/bin/pip install '.[web]'": BY_CI,
+    ".venv/bin/python tests/bench/rendering.py": "by hand, where nothing else runs",
+    ".venv/bin/tonguetrack demo --view": WITHOUT_END,
+    ".venv/bin/tonguetrack view poses.csv": ELSEWHERE + "test_window.py, on a display of its own",
+    ".venv/bin/tonguetrack render poses.csv --frame 700 -o tongue.png": HERE,
+    ".venv/bin/tonguetrack render poses.csv --size 640x360 --fps 25 -o film.mp4": HERE,
+    ".venv/bin/tonguetrack demo --web --seconds 60": WITHOUT_END,
+    ".venv/bin/tonguetrack live simulate: --web --record takes": WITHOUT_END,
+    ".venv/bin/tonguetrack live simulate: --web 0.0.0.0:8080": WITHOUT_END,
+    DEMO
+    + "osc://127.0.0.1:57120 --to 'vrchat://127.0.0.1?filter=1.5,0.5' --to 'vmc://127.0.0.1?preset=unified&rate=30'": HERE,
+    ".venv/bin/tonguetrack monitor --listen 127.0.0.1:39540 --seconds 5": HERE,
+    DEMO + "lsl:tongue": ELSEWHERE + "test_lsl_out.py, where a second program hears it",
+    DEMO + "'osc://127.0.0.1:9000?rate=60&send=shapes,coils,unit,mesh'": HERE,
+    DEMO + "oscquery://127.0.0.1": HERE,
+    ".venv/bin/tonguetrack shapes poses.csv --session session.toml": HERE,
+    TRACK_DEMO + " --out poses.csv": HERE,
+    ".venv/bin/tonguetrack export poses.csv -o tongue.glb": HERE,
+    ".venv/bin/tonguetrack export poses.csv -o meshes/tongue.ply --every 50": HERE,
+    ".venv/bin/tonguetrack export poses.csv -o other.glb --speaker=0.3,-0.1,0.2,0.1,0.2": HERE,
+    ".venv/bin/tonguetrack mesh poses.csv --frame 100 -o other.ply --speaker recordings/demo.session.toml": HERE,
+    ".venv/bin/tonguetrack demo": BY_CI,
     SIMULATED + "rtc3d --synthetic --sensors 16 --rate 400": BY_FAULTS,
     SIMULATED + "ndi --from recordings/demo.csv --pty": BY_FAULTS,
     SIMULATED + "ndi --from recordings/demo.csv --rfc2217": BY_FAULTS,
@@ -108,6 +152,8 @@ DOCS = {
     ".venv/bin/tonguetrack anatomy recordings/demo.csv --session session.toml"
     " --mesh tongue_000500.ply tongue_001500.ply tongue_002500.ply": HERE,
     ".venv/bin/tonguetrack convert recordings/demo.csv demo.npz": HERE,
+    ".venv/bin/tonguetrack simulate recording hello.csv --speaker 5 --palate hello.palate.csv": HERE,
+    ".venv/bin/tonguetrack track recordings/demo.csv --palate recordings/demo.palate.csv --save-session session.toml": HERE,
     ".venv/bin/tonguetrack simulate recording visit.csv --seconds 4 --head-motion --dropouts 0.05 "
     "--coils tongue_tip,tongue_blade,tongue_dorsum,head_nose,head_left,head_right,head_upper_incisor": HERE,
     ".venv/bin/tonguetrack calibrate visit.csv --rest 0:1 --smoothing carstens -o speaker.toml --report calibration": HERE,
@@ -152,8 +198,10 @@ def test_every_command_of_the_docs_is_run_somewhere():
 def test_what_ci_runs_it_takes_from_the_readme():
     """The two main commands are not copied into .ci/run: it reads them."""
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
-    for name in ("tonguetrack demo", "pytest -n 2", "python3-venv"):
-        assert f"readme_command '{name}'" in script
+    for name in (". && .venv/bin/tonguetrack demo", "pytest -n 2", "pip install '.[viewer"):
+        assert f"readme_command '{name}'" in script or f'readme_command "{name}"' in script
+    for name in ("python3-venv", "xvfb"):
+        assert f"install_packages '{name}'" in script
 
 
 def test_the_flags_that_pages_name_exist():
@@ -179,6 +227,10 @@ def test_the_flags_that_pages_name_exist():
         "take export",
         "calibrate",
         "evaluate-tracking",
+        "export",
+        "view",
+        "render",
+        "shapes",
     ):
         done = subprocess.run(
             [tool(), *command.split(), "--help"], capture_output=True, text=True, check=True

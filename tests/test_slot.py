@@ -129,6 +129,38 @@ def test_a_stalled_worker_gets_the_newest_pose_afterwards_and_the_others_are_cou
     assert worker.numbers == [0, 1000]
 
 
+def test_where_more_may_wait_a_burst_is_handed_on_whole_and_in_order():
+    worker = Listener()
+    worker.gate.clear()
+    sink = SlotSink(worker, waiting=8)
+    sink.start(info())
+    sink.send(pose(0))
+    assert worker.working.wait(PATIENCE_S)
+    for number in range(1, 9):
+        sink.send(pose(number))
+    worker.gate.set()
+    until(lambda: sink.sent == 9)
+    sink.close()
+    assert worker.numbers == list(range(9)) and sink.dropped == 0
+
+
+def test_where_more_may_wait_the_oldest_give_way_to_more_than_that():
+    worker = Listener()
+    worker.gate.clear()
+    sink = SlotSink(worker, waiting=8)
+    sink.start(info())
+    sink.send(pose(0))
+    assert worker.working.wait(PATIENCE_S)
+    for number in range(1, 101):
+        sink.send(pose(number))
+        assert len(sink._free) + len(sink._newest) <= 10
+    assert sink.dropped == 92
+    worker.gate.set()
+    until(lambda: sink.sent == 9)
+    sink.close()
+    assert worker.numbers == [0, *range(93, 101)]
+
+
 def test_a_stalled_worker_costs_no_memory_however_long_it_stalls():
     worker = Listener()
     worker.gate.clear()
@@ -195,6 +227,42 @@ def test_a_change_of_the_info_reaches_the_worker_before_the_next_pose():
     sink.close()
 
 
+def test_a_change_while_a_worker_fails_to_begin_is_what_it_begins_with(monkeypatch):
+    monkeypatch.setattr("tonguetrack.tracker.streams.slot.AGAIN_S", 0.01)
+    worker = Listener()
+    sink = SlotSink(worker)
+    tried = []
+
+    def begin(told):
+        tried.append(told.rate_hz)
+        if len(tried) == 1:
+            sink.change(info(400.0))  # in the middle of the first try
+            raise OSError("nobody there")
+
+    worker.begin = begin
+    sink.start(info())
+    until(lambda: len(tried) == 2)
+    sink.close()
+    assert tried == [250.0, 400.0]
+
+
+def test_a_change_while_a_worker_begins_is_told_as_well():
+    worker = Listener()
+    sink = SlotSink(worker)
+    begun = worker.begin
+
+    def begin(told):
+        if not worker.infos:
+            sink.change(info(400.0))
+        begun(told)
+
+    worker.begin = begin
+    sink.start(info())
+    until(lambda: len(worker.infos) == 2)
+    sink.close()
+    assert [told.rate_hz for told in worker.infos] == [250.0, 400.0]
+
+
 @pytest.mark.parametrize("rate_hz", [None, 5.0])
 def test_closing_hands_on_the_last_pose(rate_hz):
     worker = Listener()
@@ -205,6 +273,18 @@ def test_closing_hands_on_the_last_pose(rate_hz):
     sink.send(pose(2))
     sink.close()
     assert worker.numbers[-1] == 2
+
+
+@pytest.mark.parametrize("rate_hz", [0.01, 5e-324])
+def test_closing_does_so_at_the_slowest_rate_as_well(rate_hz):
+    worker = Listener()
+    sink = SlotSink(worker, rate_hz)
+    sink.start(info())
+    until(lambda: worker.infos)
+    time.sleep(0.05)  # it rests
+    sink.send(pose(2))
+    sink.close()
+    assert worker.numbers == [2] and worker.ended
 
 
 def test_a_worker_that_hangs_for_ever_does_not_keep_the_run_from_ending(monkeypatch):

@@ -26,7 +26,7 @@ from ..drivers.files.common import UNITS_MM
 from ..drivers.frames import FrameOfReference, Recording
 from ..model.midsagittal import midsagittal_vertices
 from ..model.multilinear import TongueModel
-from .coilmap import LATERAL_ROLES, CoilMap, checked_coil_map, guess_coil_map
+from .coilmap import LATERAL_ROLES, TONGUE_PREFIX, CoilMap, checked_coil_map, guess_coil_map
 from .headcorrection import (
     HeadMotion,
     HeadReference,
@@ -46,9 +46,10 @@ from .session import Alignment, Session, parse_session, session_toml
 from .setup import jump_sentence, preparation_of
 from .smoothing import NO_SMOOTHING, Smoothing
 from .status import MISPLACED_MM
-from .tracking import track_recording
+from .tracking import TrackingRun, track_recording
 
 HEAD_PREFIX = "head_"
+PALATE_PROBE = "palate_probe"
 LEAST_REFERENCES = 3
 LEAST_REST_FRAMES = 10
 LEAST_COILS_OF_PLANE = 2  # in the middle; the path of one shows how it moves, not where the middle is
@@ -231,15 +232,9 @@ def calibrate(
         base = _levelled(recordings, session, base, told)
     placed = still @ base.rotation.T + base.translation_mm
     if sources.palate is not None:
-        palate = _palate(sources.palate, first, session, axes, base, others, coil_map, told)
-        highest = check_above_tongue(palate, placed, first.source)
-        told.append(f"palate: {palate}; 99 % of the tongue samples stay below {highest:+.1f} mm from it")
-        aside = float(np.median(palate.points_mm[:, 0]) - np.nanmedian(placed[:, :, 0]))
-        if abs(aside) > PALATE_ASIDE_MM:
-            told.append(
-                f"note: the palate was drawn {abs(aside):.0f} mm to the {'left' if aside > 0 else 'right'} of the tongue "
-                "coils, where it is lower than above them; it bounds the tongue too tightly"
-            )
+        probe = next((channel for channel, role in others.items() if role == PALATE_PROBE), None)
+        place = Alignment(base.rotation, base.translation_mm)
+        palate = placed_palate(sources.palate, first, session, axes, place, placed, probe, told)
     else:
         palate = None
         told.append("palate: no file; nothing bounds the tongue from above")
@@ -315,9 +310,7 @@ def _coil_map(
         coil_map = guess_coil_map(recording.coils, recording.positions, recording.source)
         elsewhere: dict[str, str] = {}
     else:
-        elsewhere = {
-            channel: role for channel, role in coils.items() if role in (*BITE_ROLES, "palate_probe")
-        }
+        elsewhere = {channel: role for channel, role in coils.items() if role in (*BITE_ROLES, PALATE_PROBE)}
         here = {channel: role for channel, role in coils.items() if channel not in elsewhere}
         for channel in here:
             if channel not in recording.coils:
@@ -739,17 +732,71 @@ def _levelled(recordings: Sequence[Recording], session: Session, base: _Base, to
 # The palate -----------------------------------------------------------------------------------------
 
 
-def _palate(
+def palate_of_session(path: Path, recording: Recording, run: TrackingRun) -> tuple[Session, list[str]]:
+    """The session of a tracked recording with the palate of this file in it, and what is to be told about it.
+
+    The palate, in the recording's axes, is brought along by the session's alignment. Raises InputError where these axes
+    are not known, where the alignment turns them otherwise, and where palate and tongue contradict each other.
+    """
+    session = run.setup.session
+    frame, place = recording.frame, session.alignment
+    if "unknown" in (frame.x, frame.y, frame.z):
+        raise InputError(
+            f"{path}: a palate has the axes of its recording, and {recording.source} does not state them; "
+            "'tonguetrack calibrate' takes them with --frame, and the palate with --palate."
+        )
+    turned = place.rotation @ directions(frame, recording.source).T
+    if turned[1, 1] <= 0 or turned[2, 2] <= 0:
+        raise InputError(
+            f"{path}: {recording.source} says that its axes are x {frame.x}, y {frame.y}, z {frame.z}, which the "
+            f"[alignment] of {session.source} does not turn into the model's; correct it (axes = ...), or calibrate."
+        )
+    poses = run.experiment_2 or run.experiment_1
+    assert poses is not None
+    probe = next((channel for channel, role in session.coils.items() if role == PALATE_PROBE), None)
+    told: list[str] = []
+    still = replace(session, alignment=Alignment())
+    palate = placed_palate(path, recording, still, frame, place, poses.coils, probe, told)
+    return replace(session, palate=palate), told
+
+
+def placed_palate(
     path: Path,
     recording: Recording,
     session: Session,
     axes: FrameOfReference | None,
-    base: _Base,
-    others: Mapping[str, str],
-    coil_map: CoilMap,
+    place: Alignment,
+    tongue_mm: FloatArray,
+    probe: str | None,
     told: list[str],
 ) -> Palate:
-    """The palate in the base's frame, with the head as at rest in the recording."""
+    """The palate of a file, moved by `place` as the coils of its recording are, with the head as at rest there.
+
+    session: what it says of coils, head and smoothing, without an alignment; axes: of the recording; tongue_mm:
+    (frames, n, 3) the recording's tongue coils where `place` puts them; probe: the channel of a sweep, where it is known;
+    told: gets what there is to say. Raises InputError where the file is no palate, or none above this tongue.
+    """
+    palate = _read_in_place(path, recording, session, axes, place, probe, told)
+    highest = check_above_tongue(palate, tongue_mm, recording.source)
+    told.append(f"palate: {palate}; 99 % of the tongue samples stay below {highest:+.1f} mm from it")
+    aside = float(np.median(palate.points_mm[:, 0]) - np.nanmedian(tongue_mm[:, :, 0]))
+    if abs(aside) > PALATE_ASIDE_MM:
+        told.append(
+            f"note: the palate was drawn {abs(aside):.0f} mm to the {'left' if aside > 0 else 'right'} of the tongue "
+            "coils, where it is lower than above them; it bounds the tongue too tightly"
+        )
+    return palate
+
+
+def _read_in_place(
+    path: Path,
+    recording: Recording,
+    session: Session,
+    axes: FrameOfReference | None,
+    place: Alignment,
+    probe: str | None,
+    told: list[str],
+) -> Palate:
 
     def prepared(sweep: Recording) -> Recording:
         _check_axes(sweep, recording)
@@ -760,16 +807,14 @@ def _palate(
                 role: sweep.positions[:, sweep.coils.index(channel)] for channel, role in references.items()
             }
             check_same_head(raw, _rest_places(recording, session), sweep.source, recording.source)
-        roles = [session.coils.get(channel, "palate_probe") for channel in sweep.coils]
-        still = _still(sweep, sweep.coils, roles, session) @ base.rotation.T + base.translation_mm
+        roles = [session.coils.get(channel, PALATE_PROBE) for channel in sweep.coils]
+        still = _still(sweep, sweep.coils, roles, session) @ place.rotation.T + place.translation_mm
         return replace(sweep, positions=still, frame=MODEL_FRAME)
 
-    probes = [channel for channel, role in others.items() if role == "palate_probe"]
-    frame = axes
-    tongue = tuple(coil_map.tongue)
+    tongue = [channel for channel, role in session.coils.items() if role.startswith(TONGUE_PREFIX)]
 
     def read(unit: str | None) -> Palate:
-        return read_palate(path, frame, unit, probes[0] if probes else None, tongue, prepared)
+        return read_palate(path, axes, unit, probe, tongue, prepared)
 
     try:
         palate = read(None)
@@ -778,7 +823,7 @@ def _palate(
             raise
         palate = _trace_in_its_unit(read, told)
     if palate.frame != MODEL_FRAME:
-        palate = palate.transformed(base.rotation, base.translation_mm)
+        palate = palate.transformed(place.rotation, place.translation_mm)
     return palate
 
 

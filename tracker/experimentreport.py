@@ -17,7 +17,6 @@ from .experiments import Anatomy, Experiments, Spread, Statistics, pooled, stati
 from .status import MISPLACED_MM
 
 TABLE_FILES = ("statistics.json", "statistics.csv", "report.md")
-NO_FILMS = "Films of the tracked tongue are not written: there is no renderer yet."
 ALL = "all"
 """How the recordings together are called, where there are several."""
 
@@ -131,20 +130,26 @@ def _weight_rows(weights: dict[str, Spread]) -> list[list[str]]:
     ]
 
 
-def report_page(experiments: Experiments, statistics: dict[str, Pair], features: Sequence[str]) -> str:
-    """The folder's page, Markdown. features: names of the files with feature vectors, empty without."""
+def report_page(
+    experiments: Experiments,
+    statistics: dict[str, Pair],
+    features: Sequence[str] = (),
+    films: Sequence[str] = (),
+) -> str:
+    """The folder's page, Markdown. features, films: names of the files with feature vectors and of the films."""
     notes = [f"{take.name}: {note}" for take in experiments.takes for note in take.notes]
     blocks = [
         "# The two tracking experiments",
         _WHAT.format(version=__version__),
         _set_up(experiments),
-        NO_FILMS,
         *warnings(experiments, statistics),
         *_error_section(experiments, statistics),
         *_weight_section(experiments, statistics),
     ]
     if features:
         blocks += ["## Feature vectors", _FEATURES + ", ".join(f"`{name}`" for name in features) + "."]
+    if films:
+        blocks += ["## Films", _FILMS + ", ".join(f"[{name}]({name})" for name in films) + "."]
     blocks += ["## How it was set up", "\n".join(f"- {found}" for found in [*experiments.decisions, *notes])]
     return "\n\n".join(blocks) + "\n"
 
@@ -163,6 +168,7 @@ _WEIGHTS = (
     "x stands for the mean of the training weights plus x sigma. The violins show the density, the long line in each "
     "the mean, the short ones the interquartile range. "
 )
+_FILMS = "Each recording in both experiments, with the coils' positions and the normalised weights: "
 _FEATURES = (
     "Pose weights of experiment 2, raw and normalised, with deltas and delta-deltas (regression over two frames to "
     "either side, per frame); nothing where nothing was tracked: "
@@ -252,7 +258,6 @@ def as_json(experiments: Experiments, statistics: dict[str, Pair]) -> dict[str, 
             "normalised": model.speaker.normalised(anatomy.weights).tolist(),
             "uncertainty_sigma": _finite(anatomy.sigma.tolist()) if anatomy.sigma is not None else None,
         },
-        "films": NO_FILMS,
         "decisions": list(experiments.decisions),
         "recordings": recordings,
         "pooled": _pair_as_dict(list(statistics.values())[-1]),

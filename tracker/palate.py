@@ -89,6 +89,12 @@ class Palate:
         return turned[:, 1].copy(), turned[:, 2].copy()
 
     @property
+    def line(self) -> FloatArray:
+        """(n, 3) mm: `curve` in the mid-sagittal plane, in the model's axes."""
+        back, up = self.curve
+        return np.column_stack([np.zeros_like(back), back, up])
+
+    @property
     def directions(self) -> FloatArray:
         """(2, 3) backwards and upwards in this palate's axes: `curve` is along them."""
         return self._to_model[1:]

@@ -30,6 +30,9 @@
     weights = [...]
     source = "mean of experiment 1 over sweep 12"
 
+    [shapes]                          # avatar shape = what makes it 0 and what makes it 1
+    tip_up = [0.4, 9.1]
+
     [energy]
     alpha = 1.0
 
@@ -58,6 +61,7 @@ from .smoothing import NO_SMOOTHING, Smoothing, smoothing_from_toml, smoothing_t
 MAX_SESSION_BYTES = 1024 * 1024
 LARGEST_TERM = 1e12  # of the energy's weights: beyond, float64 loses the other terms
 NO_SESSION = "no session file"
+SHAPES_COMMENT = "avatar shape = what makes it 0 and what makes it 1: mm, degrees, or raw weight"
 _ENDLESS_KEY = re.compile(r"^(?:[^.=\n]*\.){1000}", re.MULTILINE)
 """For a key of many parts tomllib's work grows with the square of their number."""
 
@@ -122,7 +126,8 @@ class Energy:
 class Session:
     """What a session file states; None or empty = not stated.
 
-    coils: channel -> role; correspondences: role -> vertex; speaker_weights: (m,) raw.
+    coils: channel -> role; correspondences: role -> vertex; speaker_weights: (m,) raw; shape_ranges: avatar shape ->
+    (value for 0, value for 1), as `streams/shapes.py` measures it, which alone knows the shapes' names.
     """
 
     coils: Mapping[str, str] = field(default_factory=dict)
@@ -136,6 +141,7 @@ class Session:
     smoothing: Smoothing = NO_SMOOTHING
     head: HeadReference | None = None
     palate: Palate | None = None
+    shape_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def load_session(path: str | Path) -> Session:
@@ -198,8 +204,24 @@ def session_toml(session: Session) -> str:
     if session.speaker_weights is not None:
         speaker = {"weights": session.speaker_weights.tolist(), "source": session.speaker_source}
         _add_table(document, "speaker", "raw weights of the anatomy", speaker)
+    if session.shape_ranges:
+        ranges = {name: list(pair) for name, pair in session.shape_ranges.items()}
+        _add_table(document, "shapes", SHAPES_COMMENT, ranges)
     energy = {name: getattr(session.energy, name) for name in Energy.__dataclass_fields__}
     _add_table(document, "energy", "weights of the terms; box in sigma", energy)
+    return tomlkit.dumps(document)
+
+
+def with_shape_ranges(text: str, ranges: Mapping[str, tuple[float, float]]) -> str:
+    """The text of a session file with these ranges as its table [shapes]; everything else, comments too, as it was."""
+    import tomlkit
+
+    document = tomlkit.parse(text)
+    table = tomlkit.table()
+    table.comment(SHAPES_COMMENT)
+    for name, pair in ranges.items():
+        table.add(name, list(pair))
+    document["shapes"] = table
     return tomlkit.dumps(document)
 
 
@@ -223,6 +245,7 @@ def _session_from(content: Mapping[str, Any], source: str) -> Session:
         "palate",
         "correspondences",
         "speaker",
+        "shapes",
         "energy",
     }
     for table in content:
@@ -251,7 +274,15 @@ def _session_from(content: Mapping[str, Any], source: str) -> Session:
         smoothing_from_toml(_table(content, "smoothing")) if "smoothing" in content else NO_SMOOTHING,
         head_from_toml(_table(content, "head")) if "head" in content else None,
         palate_from_toml(_table(content, "palate")) if "palate" in content else None,
+        {str(name): _range(pair, f"[shapes] {name}") for name, pair in _table(content, "shapes").items()},
     )
+
+
+def _range(pair: Any, where: str) -> tuple[float, float]:
+    low, high = _numbers(pair, (2,), where).tolist()
+    if low >= high:
+        raise InputError(f"{where} = [{low:g}, {high:g}]: expected the value for 0 and a larger one for 1.")
+    return low, high
 
 
 def _alignment(table: Mapping[str, Any]) -> Alignment:

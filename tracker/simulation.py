@@ -47,6 +47,8 @@ CONTOUR_RATE_HZ = 25.0
 TRANSITION_SHARE = 0.7  # of a phone's time is movement, the rest is held
 DROPOUT_S = 0.04
 RECORDED_DECIMALS = 3  # a micrometre: far below any articulograph's resolution
+PALATE_FROM_MM = 2.0  # behind the incisors: nearer, a probe coil has no room
+PALATE_STEP_MM = 1.0
 UNSEEN_SPEAKER_OFFSET = 1000  # seeds below this belong to the training speakers' habits
 
 
@@ -212,10 +214,36 @@ def write_simulation(simulation: Simulation, path: str | Path) -> tuple[Path, Pa
     stream = io.BytesIO()
     text = json.dumps(words, ensure_ascii=False).encode()
     np.savez_compressed(stream, words=np.frombuffer(text, dtype=np.uint8), **arrays)
-    truth_path = path.with_name(f"{path.stem}.truth.npz")
     write_recording(recording, path)
-    write_atomically(truth_path, stream.getvalue())
-    return path, truth_path
+    write_atomically(truth_path(path), stream.getvalue())
+    return path, truth_path(path)
+
+
+def truth_path(path: str | Path) -> Path:
+    """Where the truth of the recording at `path` is written."""
+    return Path(path).with_name(f"{Path(path).stem}.truth.npz")
+
+
+def palate_trace(simulation: Simulation) -> FloatArray:
+    """(n, 3) mm on this speaker's hard palate, in its middle, from front to back: where a probe would be swept.
+
+    In the axes of the recording; where the head moves these are no axes of the mouth, so that raises InputError.
+    """
+    if simulation.head_motion:
+        raise InputError(
+            "--palate: a trace has one place, but with --head-motion the mouth moves in the recording's axes; leave one "
+            "of the two out."
+        )
+    anatomy, _ = unseen_speaker(simulation.speaker)
+    back = np.arange(PALATE_FROM_MM, anatomy.hard_palate_mm, PALATE_STEP_MM)
+    middle = np.zeros(len(back))
+    return np.column_stack([middle, back, anatomy.palate_z(middle, back)])
+
+
+def write_palate(points_mm: FloatArray, path: str | Path) -> None:
+    """Writes points (n, 3) mm as `palate.read_palate` reads a trace: three numbers a line, and nothing else."""
+    lines = [",".join(f"{value:.{RECORDED_DECIMALS}f}" for value in point) for point in points_mm]
+    write_atomically(path, ("\n".join(lines) + "\n").encode())
 
 
 def _phone_sequence(simulation: Simulation) -> tuple[tuple[str, ...], FloatArray]:

@@ -97,7 +97,7 @@ def _read(body, big, wanted, positions, quaternions, rms):  # type: ignore[no-un
     fields = 8 if six_d else 4
     measured = 7 if six_d else 4  # the rms of a 6D item may be anything
     place = 4 if six_d else 0
-    coils = items if items < len(positions) else len(positions)
+    coils = min(int(items), len(positions))
     for coil in range(len(positions)):
         good, moved = coil < coils, False
         item = start + 4 * fields * coil

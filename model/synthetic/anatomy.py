@@ -39,6 +39,11 @@ class Anatomy:
         opening = _smooth_step((y + 4.0) / (26.0 * self.size * self.mouth))
         return np.asarray(self.arch_mm * self.size * (0.45 + 0.55 * opening))
 
+    @property
+    def hard_palate_mm(self) -> float:
+        """How far behind the incisors the bone ends and the soft palate, which moves, takes over."""
+        return 50.0 * self.size * self.mouth
+
     def palate_z(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height of the palate above a place (x, y), mm: ridge, vault, soft palate; beside the
         arch it stays at the height of its edge."""

@@ -23,14 +23,17 @@ def build_parser() -> argparse.ArgumentParser:
         doctor,
         evaluate,
         experiment,
+        export,
         files,
         live,
         model,
         monitor,
         mri,
+        shapes,
         simulate,
         take,
         track,
+        view,
     )
 
     parser = argparse.ArgumentParser(
@@ -40,8 +43,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"tonguetrack {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for family in (
-        demo, live, track, calibrate, anatomy, files, take, devices, doctor, model, mri, evaluate, experiment, simulate,
-        monitor, bench,
+        demo, live, track, view, export, calibrate, anatomy, files, take, devices, doctor, model, mri, evaluate, experiment,
+        simulate, monitor, shapes, bench,
     ):  # fmt: skip
         family.add_commands(commands)
     return parser

@@ -5,24 +5,26 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from contextlib import ExitStack
+
+from .outputs import add_output_flags
 
 
 def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Register `demo`."""
     demo = subparsers.add_parser(
         "demo",
-        help="replay the bundled sample recording, track it, stream it over OSC",
-        description="Replays the bundled synthetic recording in real time through the bundled synthetic model and "
-        "streams the poses over OSC. Ctrl-C ends it with the summary and exit code 0.",
+        help="replay the bundled sample recording, track it, show and stream it",
+        description="Replays the bundled synthetic recording in real time through the bundled synthetic model, streams the "
+        "poses and shows them where asked. Ctrl-C ends it with the summary and exit code 0.",
     )
-    demo.add_argument(
-        "--osc", metavar="HOST:PORT", default="127.0.0.1:9000", help="where to send (%(default)s)"
-    )
+    add_output_flags(demo)
     demo.add_argument(
         "--seconds",
         type=positive_seconds,
         metavar="N",
-        help="stop after N seconds of the recording, repeating it if need be (default: once)",
+        help="stop after N seconds of the recording, repeating it if need be (default: once; while it is shown, until "
+        "Ctrl-C or until the window is closed)",
     )
     demo.add_argument("--fast", action="store_true", help="do not wait between frames")
     demo.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -42,28 +44,38 @@ def positive_seconds(text: str) -> float:
 
 def run_demo(args: argparse.Namespace) -> int:
     """Stream the bundled recording and print the summary."""
+    from ...drivers.replay import ReplaySource
     from ..bundled import bundled_model, bundled_recording
-    from ..live import stream_recording
+    from ..live import run_live, stream_info
     from ..online import Tracker
     from ..setup import complete_setup
-    from ..streams.osc import resolve
+    from ..status import LiveStatus
+    from .outputs import destinations, open_outputs, outputs_of
     from .watching import announced_compilation, watched
 
-    resolve(args.osc)
+    outputs = outputs_of(args)
     model = bundled_model()
     recording, session = bundled_recording()
     setup = complete_setup(recording, model, session)
     speaker = "free" if setup.session.speaker_weights is None else "fixed"
-    print(
-        f"demo: synthetic recording, {recording.duration_s:.1f} s at {recording.rate_hz:g} Hz, coils "
-        f"{', '.join(setup.roles)}; synthetic model '{model.name}', speaker {speaker}; OSC to {args.osc}",
-        file=sys.stderr,
-        flush=True,
-    )
+    tracker = Tracker(model, setup, recording.rate_hz)
     with announced_compilation():
-        Tracker(model, setup).warm_up()
-    summary = stream_recording(
-        recording, model, setup, args.osc, realtime=not args.fast, seconds=args.seconds, watch=watched
-    )
+        tracker.warm_up()
+    seconds = float("inf") if outputs.shown and args.seconds is None else args.seconds
+    source = ReplaySource(recording, speed=None if args.fast else 1.0, loop=seconds is not None)
+    info = stream_info(model, setup, source.rate_hz)
+    with ExitStack() as stack:
+        opened = open_outputs(outputs, tracker, stack, title="synthetic demo", window_closed=source.stop)
+        print(
+            f"demo: synthetic recording, {recording.duration_s:.1f} s at {recording.rate_hz:g} Hz, coils "
+            f"{', '.join(setup.roles)}; synthetic model '{model.name}', speaker {speaker}; to "
+            f"{destinations(opened.sinks)}",
+            file=sys.stderr,
+            flush=True,
+        )
+        status = LiveStatus(setup.roles, opened.sinks)
+        opened.status = status
+        with watched(source, status):
+            summary = run_live(source, tracker, info, opened.sinks, status, seconds)
     print(json.dumps(summary.as_dict(), indent=2, allow_nan=False) if args.json else summary)
     return 0

@@ -6,7 +6,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from ... import InputError
 from .names import (
     BUNDLED,
     add_recording_flags,
@@ -16,6 +18,10 @@ from .names import (
     named_model,
     prepare_folder,
 )
+from .showing import with_progress
+
+if TYPE_CHECKING:
+    from ..experiments import Experiments
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -48,6 +54,10 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="also write experiment 2's pose weights at this frame rate, with deltas, as CSV and NPZ",
     )  # fmt: skip
     experiment.add_argument(
+        "--films", action="store_true",
+        help="also film every recording in both experiments (extras 'viewer' and 'video')",
+    )  # fmt: skip
+    experiment.add_argument(
         "--coils", metavar="CHANNEL=ROLE,...", help="which channel is which coil, where names do not tell"
     )
     experiment.add_argument("--json", action="store_true", help="the statistics as JSON on stdout")
@@ -60,7 +70,6 @@ def run_experiment(args: argparse.Namespace) -> int:
     from ...drivers import open_recording
     from ..experimentplots import PICTURE_FILES, pictures, require_plotting
     from ..experimentreport import (
-        NO_FILMS,
         TABLE_FILES,
         all_statistics,
         as_csv,
@@ -78,6 +87,8 @@ def run_experiment(args: argparse.Namespace) -> int:
     require_plotting()
     if args.features is not None:
         check_rate(args.features)
+    if args.films:
+        require_films()
     jobs, left_out = plan_jobs(args.recordings, None, ())
     paths = [job.path for job in jobs]
     names = short_names(paths)
@@ -85,7 +96,10 @@ def run_experiment(args: argparse.Namespace) -> int:
     features = (
         [f"features_{name}.{kind}" for name in names for kind in ("csv", "npz")] if args.features else []
     )
-    outputs = [folder / name for name in (*TABLE_FILES, *PICTURE_FILES, *features)]
+    films = (
+        [f"film_{name}_experiment_{number}.mp4" for name in names for number in (1, 2)] if args.films else []
+    )
+    outputs = [folder / name for name in (*TABLE_FILES, *PICTURE_FILES, *features, *films)]
     keep_apart(outputs, map(Path, [*paths, args.model, *([args.session] if args.session else [])]))
     model = named_model(args.model)
     session = read_session(args)
@@ -107,7 +121,7 @@ def run_experiment(args: argparse.Namespace) -> int:
     for warning in warnings(done, statistics):
         print(f"  {warning}", file=sys.stderr)
     numbers = json_text(done, statistics)
-    page = report_page(done, statistics, features)
+    page = report_page(done, statistics, features, films)
     tables = (numbers.encode(), as_csv(statistics).encode(), page.encode())
     for name, content in (*zip(TABLE_FILES, tables, strict=True), *pictures(done)):
         write_atomically(folder / name, content)
@@ -116,13 +130,40 @@ def run_experiment(args: argparse.Namespace) -> int:
             vectors = features_of(take.experiment_2, args.features)
             for kind in ("csv", "npz"):
                 write_features(vectors, take.experiment_2, folder / f"features_{take.name}.{kind}")
+    if args.films:
+        write_films(done, [folder / name for name in films])
     if args.json:
         print(numbers, end="")
     else:
         print(text_table(statistics))
-        print(NO_FILMS)
     print(f"  written: {len(outputs)} files in {folder}; begin with {folder / 'report.md'}", file=sys.stderr)
     return 0
+
+
+def require_films() -> None:
+    """Raises InputError, before the work, where films cannot be made here."""
+    from ..viewer.film import NO_VIDEO, can_film
+    from ..viewer.offscreen import egl_context
+
+    egl_context().release()
+    if not can_film():
+        raise InputError(NO_VIDEO)
+
+
+def write_films(done: Experiments, targets: Sequence[Path]) -> None:
+    """Two films a take, experiment 1 and 2, under these names (paper, section "Experiments": its supplement)."""
+    from ..viewer.film import Shot, write_film
+    from ..viewer.scene import moments_of, scene_of
+
+    runs = [
+        (f"{take.name}, experiment {number}", poses)
+        for take in done.takes
+        for number, poses in ((1, take.experiment_1), (2, take.experiment_2))
+    ]
+    for (title, poses), target in zip(runs, targets, strict=True):
+        scene = scene_of(done.model, done.session, poses.roles, poses.correspondences, title)
+        shot = Shot(scene, moments_of(poses))
+        write_film(with_progress(shot, title), target, shot.fps, shot.begin_s, shot.size)
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from .demo import positive_seconds
 from .names import BUNDLED
+from .outputs import add_output_flags
 
 if TYPE_CHECKING:
     from ...drivers.devices.authors_live import AuthorsLive
@@ -20,10 +21,10 @@ if TYPE_CHECKING:
     from ..live import LiveRun
     from ..online import Tracker
     from ..session import Session
-    from ..status import LiveStatus, Summary
+    from ..status import Summary
     from ..streams.sink import Sink
+    from .outputs import Outputs
 
-DEFAULT_OSC = "127.0.0.1:9000"
 LISTEN_S = 3.0
 """So long a device is listened to where the session leaves coils or vertices open."""
 FIX_AFTER_S = 5.0
@@ -47,8 +48,7 @@ def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]
     live.add_argument(
         "--coils", metavar="CHANNEL=ROLE,...", help="which channel is which coil, where names do not tell"
     )
-    live.add_argument("--osc", metavar="HOST:PORT", action="append",
-                      help=f"where to send; may be given several times (default {DEFAULT_OSC})")  # fmt: skip
+    add_output_flags(live)
     live.add_argument("--record", metavar="TAKE.xdf",
                       help="record from the start; a folder instead: takes begin when asked for (key t, or OSC)")  # fmt: skip
     live.add_argument(
@@ -81,15 +81,13 @@ def run_live_command(args: argparse.Namespace) -> int:
     from ..guided import check_new_folder
     from ..online import compile_kernels
     from ..sources import open_source
-    from ..streams.osc import resolve
     from ..takes.keeper import check_place, is_folder
     from .names import keep_apart, named_model, prepare_folder
+    from .outputs import outputs_of
     from .track import read_session
     from .watching import announced_compilation
 
-    destinations = args.osc or [DEFAULT_OSC]
-    for destination in destinations:
-        resolve(destination)
+    outputs = outputs_of(args)
     model = named_model(args.model)
     session = read_session(args)
     for output in filter(None, (args.save_session, args.record)):
@@ -110,21 +108,22 @@ def run_live_command(args: argparse.Namespace) -> int:
         compile_kernels(model)
     controls = ControlQueue()
     with ExitStack() as stack:
-        serve_controls(args.control, controls, stack)
+        control = serve_controls(args.control, controls, stack)
         say(f"opening {args.source}")
-        job = Job(args, model, session, destinations, controls)
+        job = Job(args, model, session, outputs, controls, control)
         return follow(job, open_source(args.source))
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a person asked for, read and checked."""
+    """What a person asked for, read and checked. control: where control messages are taken, "" = nowhere."""
 
     args: argparse.Namespace
     model: TongueModel
     session: Session
-    destinations: list[str]
+    outputs: Outputs
     controls: ControlQueue
+    control: str
 
 
 def follow(job: Job, source: Source) -> int:
@@ -217,15 +216,21 @@ def run_once(job: Job, source: Source, tracker: Tracker) -> Summary:
     from ..streams.addresses import CONTROL_TAKE
     from ..takes.describing import take_info
     from ..takes.keeper import TakeKeeper, is_folder
+    from .outputs import destinations, open_outputs
     from .watching import announced_compilation, say_above, status_line
 
     with announced_compilation():
         tracker.warm_up()
-    if isinstance(source, DeviceSource):
-        source.catch_up()
-    args, status = job.args, LiveStatus(tracker.setup.roles)
+    args = job.args
     with ExitStack() as stack:
-        status.sinks = tuple(open_sinks(source, job.destinations, status, stack))
+        opened = open_outputs(
+            job.outputs, tracker, stack, model_name=args.model, control=job.control, title=source.address
+        )
+        sinks = [*opened.sinks, *answers_to(source, stack)]
+        if isinstance(source, DeviceSource):
+            source.catch_up()
+        status = LiveStatus(tracker.setup.roles, sinks)
+        opened.status = status
         keeper = None
         if args.record:
             keeper = TakeKeeper(
@@ -242,7 +247,7 @@ def run_once(job: Job, source: Source, tracker: Tracker) -> Summary:
             tracker,
             stream_info(tracker.model, tracker.setup, tracker.rate_hz),
             status,
-            status.sinks,
+            sinks,
             keeper,
             job.controls,
             fix_after_s=args.fix_speaker_after,
@@ -252,7 +257,7 @@ def run_once(job: Job, source: Source, tracker: Tracker) -> Summary:
         )
         if args.speaker == "joint" and tracker.setup.session.speaker_weights is None:
             estimate_beside(run, stack)
-        say(f"tracking {', '.join(tracker.setup.roles)} to {', '.join(s.destination for s in status.sinks)}")
+        say(f"tracking {', '.join(tracker.setup.roles)} to {destinations(sinks)}")
         with status_line(status):
             summary = run.run()
     if args.save_session:
@@ -264,26 +269,21 @@ def run_once(job: Job, source: Source, tracker: Tracker) -> Summary:
     return summary
 
 
-def open_sinks(source: Source, destinations: list[str], status: LiveStatus, stack: ExitStack) -> list[Sink]:
-    """The ways out: OSC, and the answers where clients of the authors' server drive the source."""
+def answers_to(source: Source, stack: ExitStack) -> list[Sink]:
+    """Where clients of the authors' server drive the source, they are answered."""
     from ...drivers.devices.authors_live import AuthorsLive
     from ..streams.authors import AuthorsSink
-    from ..streams.osc import OscSink
 
-    sinks: list[Sink] = []
-    for destination in destinations:
-        sink = OscSink(destination)
-        sink.numbers = lambda: status.numbers
-        sinks.append(sink)
-    if isinstance(source, AuthorsLive):
-        sinks.append(AuthorsSink(source.reply))
-    for each in sinks:
-        stack.callback(each.close)
-    return sinks
+    if not isinstance(source, AuthorsLive):
+        return []
+    sink = AuthorsSink(source.reply)
+    stack.callback(sink.close)
+    return [sink]
 
 
-def serve_controls(address: str | None, controls: ControlQueue, stack: ExitStack) -> None:
-    """Listens for control messages. That the usual port is taken stops no run, unless it was asked for."""
+def serve_controls(address: str | None, controls: ControlQueue, stack: ExitStack) -> str:
+    """Listens for control messages; where, "" = nowhere. That the usual port is taken stops no run, unless it was
+    asked for."""
     from ... import InputError
     from ..streams.control_osc import DEFAULT_CONTROL, OscControl
     from .watching import say_above
@@ -294,8 +294,9 @@ def serve_controls(address: str | None, controls: ControlQueue, stack: ExitStack
         if address:
             raise
         say(f"no control over OSC: {reason}")
-    else:
-        say(f"control over OSC at {control.address}")
+        return ""
+    say(f"control over OSC at {control.address}")
+    return control.address
 
 
 def estimate_beside(run: LiveRun, stack: ExitStack) -> None:

@@ -13,6 +13,8 @@ from ... import InputError
 
 if TYPE_CHECKING:
     from ...model.multilinear import TongueModel
+    from ..pose import TrackedPoses
+    from ..transfer import OtherSpeaker
 
 BUNDLED = "bundled"
 
@@ -26,6 +28,56 @@ def named_model(name: str) -> TongueModel:
     from ...model.files import load_model
 
     return load_model(name)
+
+
+def poses_and_model(path: str, model_name: str | None = None) -> tuple[TrackedPoses, TongueModel]:
+    """Tracked poses and the model that they belong to: the one of this name, else the one that the file names."""
+    from ..posefiles import read_poses
+
+    given = named_model(model_name) if model_name else None
+    poses = read_poses(path, given)
+    model = given or _model_of(poses, path)
+    check_model(poses, model, path)
+    return poses, model
+
+
+def check_model(poses: TrackedPoses, model: TongueModel, path: str) -> None:
+    """Raises InputError where the poses of this file belong to another model."""
+    if poses.model_fingerprint and poses.model_fingerprint != model.fingerprint:
+        raise InputError(
+            f"{path}: the poses were tracked with the model {poses.model_name} [{poses.model_fingerprint}], "
+            f"but {model.name} is [{model.fingerprint}]; name the right one with --model."
+        )
+
+
+def _model_of(poses: TrackedPoses, path: str) -> TongueModel:
+    if not poses.model_path:
+        raise InputError(f"{path}: it does not say which model it belongs to; name it with --model.")
+    if poses.model_path != BUNDLED and not Path(poses.model_path).is_file():
+        raise InputError(f"{path}: its model {poses.model_path} is not there any more; name it with --model.")
+    return named_model(poses.model_path)
+
+
+def add_speaker_flag(parser: argparse.ArgumentParser) -> None:
+    """For every command that makes a mesh of tracked poses; see `replayed`."""
+    parser.add_argument(
+        "--speaker",
+        metavar="FILE|WEIGHTS",
+        help="the same motion on another speaker's anatomy: a session file (.toml) with [speaker] weights, or the raw "
+        "weights themselves, --speaker=0.1,-0.2,...",
+    )
+
+
+def replayed(
+    poses: TrackedPoses, model: TongueModel, speaker: str | None
+) -> tuple[TrackedPoses, OtherSpeaker | None]:
+    """The poses as --speaker wants them, and that speaker; without it the poses themselves, and None."""
+    if speaker is None:
+        return poses, None
+    from ..transfer import other_speaker, transferred
+
+    other = other_speaker(speaker, model)
+    return transferred(poses, other), other
 
 
 def as_text(name: str) -> str:

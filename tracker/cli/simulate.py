@@ -7,6 +7,7 @@ import re
 import signal
 import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ... import InputError
@@ -70,6 +71,8 @@ def _add_recording(kinds: argparse._SubParsersAction[argparse.ArgumentParser]) -
     recording.add_argument("--dropouts", type=float, default=0.0, metavar="SHARE",
                            help="share of each coil's samples that are missing, in short runs (default 0)")  # fmt: skip
     recording.add_argument("--head-motion", action="store_true", help="move the head; all coils move with it")
+    recording.add_argument("--palate", metavar="FILE", help="also write a trace of this speaker's palate: x, y, z of "
+                           "a point a line, mm, in the recording's axes")  # fmt: skip
     recording.add_argument("--seed", type=int, default=1, help="of noise, dropouts, habits (default 1)")
     recording.set_defaults(run=run_recording)
 
@@ -126,7 +129,8 @@ def _add_device(kinds: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 
 def run_recording(args: argparse.Namespace) -> int:
-    from ..simulation import Simulation, write_simulation
+    from ..simulation import Simulation, palate_trace, truth_path, write_palate, write_simulation
+    from .names import prepare_folder
 
     simulation = Simulation(
         phones=tuple(args.phones.split()),
@@ -140,8 +144,19 @@ def run_recording(args: argparse.Namespace) -> int:
         head_motion=args.head_motion,
         seed=args.seed,
     )
+    if args.palate:
+        trace = palate_trace(simulation)
+        taken = [Path(args.output).resolve(), truth_path(args.output).resolve()]
+        if Path(args.palate).resolve() in taken:
+            raise InputError(
+                f"--palate {args.palate}: the recording or its truth goes there; choose another name."
+            )
+        prepare_folder(Path(args.palate))
     recording, truth = write_simulation(simulation, args.output)
     print(f"written: {recording} and {truth} (synthetic speaker {args.speaker})", file=sys.stderr)
+    if args.palate:
+        write_palate(trace, args.palate)
+        print(f"written: {args.palate} ({len(trace)} points of this speaker's palate)", file=sys.stderr)
     return 0
 
 

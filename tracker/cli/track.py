@@ -13,7 +13,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ... import InputError
-from .names import BUNDLED, add_recording_flags, keep_apart, named_model, parsed_coils, prepare_folder
+from .names import (
+    BUNDLED,
+    add_recording_flags,
+    add_speaker_flag,
+    keep_apart,
+    named_model,
+    parsed_coils,
+    prepare_folder,
+    replayed,
+)
+from .showing import poses_to_show
 
 if TYPE_CHECKING:
     from ...drivers.frames import Recording
@@ -39,25 +49,29 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
                        help="1: anatomy and pose free in every frame; 2: anatomy fixed (default)")  # fmt: skip
     track.add_argument("--out", metavar="FILE", help="poses.csv, .json (as the authors' tracker writes) or .npz; "
                        "for several recordings a folder, or a name with {name} in it")  # fmt: skip
+    track.add_argument("--palate", metavar="FILE", help="put this palate into the session that is saved: a trace in the "
+                       "recording's axes, or a recording of a swept probe")  # fmt: skip
     track.add_argument("--save-session", metavar="FILE",
                        help="write the session with everything that was estimated, to be edited and used again")  # fmt: skip
     track.add_argument(
         "--coils", metavar="CHANNEL=ROLE,...", help="which channel is which coil, where names do not tell"
     )
     track.add_argument("--osc", metavar="HOST:PORT", help="also stream the poses over OSC")
+    track.add_argument("--view", action="store_true", help="show the poses in a window (extra 'viewer')")
     track.add_argument("--realtime", action="store_true", help="stream at the recording's own pace")
     track.add_argument("--json", action="store_true", help="the summary as JSON on stdout")
     add_recording_flags(track)
     track.set_defaults(run=run_track)
 
     mesh = commands.add_parser("mesh", help="meshes of tracked frames")
-    mesh.add_argument("poses", metavar="POSES", help="what 'track --out' wrote")
+    mesh.add_argument("poses", metavar="POSES", help="what 'track --out' wrote, or a take.xdf")
     which = mesh.add_mutually_exclusive_group(required=True)
     which.add_argument("--frame", type=int, metavar="N", help="one frame, counted from 0")
     which.add_argument(
         "--every", type=int, metavar="K", help="every K-th frame, numbered: tongue_000000.ply, ..."
     )
     mesh.add_argument("-o", "--output", required=True, metavar="FILE", help="tongue.ply or tongue.obj")
+    add_speaker_flag(mesh)
     mesh.add_argument("--model", help="the model, where it is not where the poses say")
     mesh.set_defaults(run=run_mesh)
 
@@ -76,11 +90,15 @@ class Job:
 def run_track(args: argparse.Namespace) -> int:
     experiments = (1, 2) if args.experiment == "both" else (int(args.experiment),)
     jobs, left_out = plan_jobs(args.recordings, args.out, experiments)
-    if len(jobs) > 1 and (args.osc or args.save_session):
-        flag = "--osc" if args.osc else "--save-session"
+    if len(jobs) > 1 and (args.osc or args.save_session or args.view):
+        flag = "--osc" if args.osc else "--save-session" if args.save_session else "--view"
         raise InputError(f"{flag} takes one recording; {len(jobs)} were found. Track them one by one.")
     if args.realtime and not args.osc:
         raise InputError("--realtime paces a stream; say where to with --osc HOST:PORT.")
+    if args.palate and not args.save_session:
+        raise InputError(
+            "--palate goes into the session that is saved; say where to with --save-session FILE."
+        )
     if args.osc:
         from ..streams.osc import resolve
 
@@ -93,7 +111,8 @@ def run_track(args: argparse.Namespace) -> int:
     outputs = [output for job in jobs for output in job.outputs.values()]
     if args.save_session:  # which may well replace --session
         outputs.append(Path(args.save_session))
-    keep_apart(outputs, [*(job.path for job in jobs), Path(args.model)])
+    read = [*(job.path for job in jobs), Path(args.model)]
+    keep_apart(outputs, [*read, Path(args.palate)] if args.palate else read)
     for file in outputs:
         prepare_folder(file)
 
@@ -137,6 +156,12 @@ def _track_one(
 
     recording = open_recording(job.path, rate_hz=args.rate, unit=args.unit, layout=args.layout)
     run = track_recording(recording, model, session, experiments)
+    if args.palate:
+        from ..calibration import palate_of_session
+
+        with_palate, told = palate_of_session(Path(args.palate), recording, run)
+        setup = replace(run.setup, session=with_palate, decisions=(*run.setup.decisions, *told))
+        run = replace(run, setup=setup)
     report = summarise(run, recording, model)
     _print_report(report)
     model_path = BUNDLED if args.model == BUNDLED else str(Path(args.model).resolve())
@@ -157,9 +182,25 @@ def _track_one(
         stream = stream_recording(recording, model, setup, args.osc, realtime=args.realtime, watch=watched)
         print(stream, file=sys.stderr)
         report["stream"] = stream.as_dict()
-    if not job.outputs and not args.osc:
-        print("  nothing was written; add --out poses.csv or --osc HOST:PORT", file=sys.stderr)
+    if args.view:
+        _show(run, model, job.path.stem)
+    if not job.outputs and not args.osc and not args.view:
+        print("  nothing was written; add --out poses.csv, --osc HOST:PORT or --view", file=sys.stderr)
     return report
+
+
+def _show(run: TrackingRun, model: TongueModel, name: str) -> None:
+    """The poses in a window. One that cannot be opened is a sentence: the tracking is done."""
+    from ..viewer.player import play
+    from ..viewer.scene import moments_of
+    from .showing import scene_to_show
+
+    poses = run.experiment_2 or run.experiment_1
+    assert poses is not None
+    try:
+        play(scene_to_show(poses, model, run.setup.session, name), moments_of(poses))
+    except InputError as reason:
+        print(f"  no window: {reason}", file=sys.stderr)
 
 
 def plan_jobs(
@@ -330,47 +371,30 @@ def _with_progress(jobs: list[Job]) -> Any:
 
 def run_mesh(args: argparse.Namespace) -> int:
     from ...atomic import write_atomically
-    from ...model.mesh import MESH_SUFFIXES, Mesh, mesh_bytes
-    from ..posefiles import read_poses
+    from ...model.mesh import MESH_SUFFIXES, mesh_bytes
+    from ..exporting import frame_mesh, write_mesh_sequence
 
     target = Path(args.output)
     if target.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(
             f"{target}: meshes are written as {' or '.join(MESH_SUFFIXES)}; end the name in one of them."
         )
-    given = named_model(args.model) if args.model else None
-    poses = read_poses(args.poses, given)
-    model = given or _model_of(poses, Path(args.poses))
-    if poses.model_fingerprint and poses.model_fingerprint != model.fingerprint:
-        raise InputError(
-            f"{args.poses}: the poses were tracked with the model {poses.model_name} [{poses.model_fingerprint}], "
-            f"but {model.name} is [{model.fingerprint}]; name the right one with --model."
-        )
+    poses, model, _ = poses_to_show(args.poses, args.model)
+    poses, _ = replayed(poses, model, args.speaker)
     if args.frame is not None:
         if not 0 <= args.frame < poses.frame_count:
             raise InputError(
                 f"--frame {args.frame}: {args.poses} has the frames 0 to {poses.frame_count - 1}."
             )
-        frames = [args.frame]
+        prepare_folder(target)
+        write_atomically(target, mesh_bytes(frame_mesh(model, poses, args.frame), target.suffix))
+        written = str(target)
     else:
         if args.every < 1:
             raise InputError(f"--every {args.every}: expected 1 or more.")
-        frames = list(range(0, poses.frame_count, args.every))
-    prepare_folder(target)
-    for frame in frames:
-        mesh = Mesh(model.vertices(poses.speaker_weights[frame], poses.weights[frame]), model.faces)
-        numbered = target.with_name(f"{target.stem}_{frame:06d}{target.suffix}")
-        write_atomically(target if args.frame is not None else numbered, mesh_bytes(mesh, target.suffix))
-    written = str(target) if args.frame is not None else f"{len(frames)} meshes beside {target}"
+        frames = range(0, poses.frame_count, args.every)
+        prepare_folder(target)
+        write_mesh_sequence(model, poses, frames, target)
+        written = f"{len(frames)} meshes beside {target}"
     print(f"written: {written} ({model.name}, {model.vertex_count} vertices, mm)", file=sys.stderr)
     return 0
-
-
-def _model_of(poses: TrackedPoses, source: Path) -> TongueModel:
-    if not poses.model_path:
-        raise InputError(f"{source}: it does not say which model it belongs to; name it with --model.")
-    if poses.model_path != BUNDLED and not Path(poses.model_path).is_file():
-        raise InputError(
-            f"{source}: its model {poses.model_path} is not there any more; name it with --model."
-        )
-    return named_model(poses.model_path)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
 PROTOCOL_NAME = "tonguetrack"
 PROTOCOL_VERSION = 1
 MAX_DATAGRAM_BYTES = 1400
+MAX_BLOB_BYTES = 1300
+"""Receivers lose longer blobs, or the datagrams they come in."""
 MAX_CONTROL_TEXT = 200
 DEFAULT_CONTROL_PORT = 9001
 INFO_PERIOD_S = 1.0
@@ -16,26 +19,39 @@ NO_RESIDUAL = -1.0
 NO_LATENCY = -1.0
 SPEAKER_FIXED, SPEAKER_FREE = "fixed", "free"
 
-_VALUE_TYPES: dict[str, tuple[type, ...]] = {"i": (int,), "f": (float,), "s": (str,)}
+_VALUE_TYPES: dict[str, tuple[type, ...]] = {
+    "i": (int,),
+    "f": (float,),
+    "s": (str,),
+    "b": (bytes,),
+    "T": (bool,),
+}
+_UNSAFE = re.compile(r"[^A-Za-z0-9_.-]")
 
 
 @dataclass(frozen=True)
 class Argument:
-    """tag: OSC type, "i", "f" or "s"; count: "" for one, else the letter for how many (K, m or n)."""
+    """tag: OSC type, "i", "f", "s", "b" or "T" for true or false; count: "" for one, else the letter for how many.
+
+    limits: the smallest and the largest value that can come, None where there is no such limit.
+    """
 
     name: str
     tag: str
     unit: str = ""
     count: str = ""
+    limits: tuple[float, float] | None = None
 
     def __str__(self) -> str:
         unit = f" ({self.unit})" if self.unit else ""
+        if self.tag == "T":
+            unit = " (type T or F)"
         return f"{self.count} x {self.name}{unit}" if self.count else f"{self.name}{unit}"
 
 
 @dataclass(frozen=True)
 class Address:
-    """One row of the table. A `<k>` in the path stands for the index of a coefficient, from 0."""
+    """One row of a table. In the path stands `<k>` for the index of a coefficient, from 0, `<name>` for a name."""
 
     path: str
     arguments: tuple[Argument, ...]
@@ -50,10 +66,25 @@ class Address:
 
     @cached_property
     def _pattern(self) -> re.Pattern[str]:
-        return re.compile(re.escape(self.path).replace(re.escape("<k>"), "[0-9]{1,3}"))
+        pattern = re.escape(self.path).replace(re.escape("<k>"), "[0-9]{1,3}")
+        return re.compile(pattern.replace(re.escape("<name>"), "(?P<name>[A-Za-z0-9_./-]{1,80})"))
 
     def matches(self, path: str) -> bool:
         return self._pattern.fullmatch(path) is not None
+
+    def name_in(self, path: str) -> str:
+        """What stands for `<name>` in a path that matches."""
+        found = self._pattern.fullmatch(path)
+        assert found is not None, "matches() comes first"
+        return found.group("name")
+
+    def named(self, name: str) -> str:
+        """The path for one name; what OSC reserves becomes _."""
+        return self.path.replace("<name>", _UNSAFE.sub("_", name)[:80] or "_")
+
+    def at(self, index: int) -> str:
+        """The path for one coefficient."""
+        return self.path.replace("<k>", str(index))
 
     def fits(self, values: list[object]) -> bool:
         """Whether decoded arguments have the types and the number that the row states."""
@@ -71,7 +102,7 @@ class Address:
 
 FRAME = Address(
     "/tongue/frame",
-    (Argument("sequence number", "i"), Argument("time", "f", "s"), Argument("status", "i")),
+    (Argument("sequence number", "i"), Argument("time", "f", "s"), Argument("status", "i", limits=(0, 3))),
     "every frame",
     "The sequence number counts this stream's frames from 0, so a gap is a lost datagram. The time is the "
     "device's, since the stream's first frame. Status: see below.",
@@ -160,7 +191,7 @@ LATENCY = Address(
 )
 COIL_STATES = Address(
     "/tongue/coilstates",
-    (Argument("state", "i", count="n"),),
+    (Argument("state", "i", count="n", limits=(0, 5)),),
     "every second, and with the frame in which one changes",
     "What became of each coil, in the order of `/tongue/coils`: see below. Not sent where coils are not watched.",
 )
@@ -172,10 +203,85 @@ TAKE = Address(
     "written, an empty text as long as nothing is wrong. Long texts are cut.",
 )
 
+EXTRA = Address(
+    "/tongue/extra",
+    (Argument("sequence number", "i"), Argument("frame number", "i"), Argument("time", "f", "s")),
+    "first in every bundle of `send=`",
+    "Which pose the rest of the bundle belongs to. The sequence number counts the poses of this stream from 0 and is "
+    "the same in every datagram of one pose; the frame number is the source's own; the time is the device's, since "
+    "this stream's first pose.",
+)
+COIL = Address(
+    "/tongue/coil/<name>",
+    (Argument("x", "f", "mm"), Argument("y", "f", "mm"), Argument("z", "f", "mm")),
+    "`send=coils`",
+    "Where the coil of this role is, in the model's frame, trusted or not. Left out while it is missing.",
+)
+SHAPE = Address(
+    "/tongue/shape/<name>",
+    (Argument("value", "f", limits=(0.0, 1.0)),),
+    "`send=shapes`",
+    "One of the named shapes, see shapes.md.",
+)
+UNIT = Address(
+    "/tongue/unit",
+    (Argument("weight", "f", "0 to 1", "K"),),
+    "`send=unit`",
+    "The coefficients re-based: (weight - low) / (high - low). Exact also outside 0..1, where a pose beyond the range "
+    "lies; the shapes `pose_0`, `pose_1`, ... are the same numbers, cut to 0..1.",
+)
+LOW = Address(
+    "/tongue/low",
+    (Argument("weight", "f", "raw", "K"),),
+    "`send=unit`: start, every second",
+    "The raw coefficients that 0 stands for in `/tongue/unit`: mean - 3 spread, unless the session has other ranges.",
+)
+HIGH = Address(
+    "/tongue/high",
+    (Argument("weight", "f", "raw", "K"),),
+    "`send=unit`: start, every second",
+    "The raw coefficients that 1 stands for: mean + 3 spread, or the session's.",
+)
+CONTACT = Address(
+    "/tongue/contact",
+    (
+        Argument("gap", "f", "mm"),
+        Argument("x", "f", "mm"),
+        Argument("y", "f", "mm"),
+        Argument("z", "f", "mm"),
+    ),
+    "`send=contact`",
+    "The smallest distance of tongue and palate in the mid-sagittal plane, below 0 where the tongue lies above the "
+    "palate; the tongue's point there, in the model's frame. Needs a palate in the session. Left out where the palate "
+    "reaches over no part of the tongue.",
+)
+GAP = Address(
+    "/tongue/gap/<name>",
+    (Argument("gap", "f", "mm"),),
+    "`send=contact`",
+    "The same for one region of the tongue's contour: tip, blade, front, body or back. Left out where the palate reaches "
+    "over no part of it.",
+)
+MESH = Address(
+    "/tongue/mesh",
+    (
+        Argument("sequence number", "i"),
+        Argument("chunk", "i"),
+        Argument("chunks", "i"),
+        Argument("first vertex", "i"),
+        Argument("step", "f", "mm"),
+        Argument("coordinates", "b"),
+    ),
+    "`send=mesh`: alone in a datagram",
+    "A part of the mesh: x, y, z of one vertex after the other as big-endian 16-bit integers; times step, they are mm in "
+    f"the model's frame. The blob has at most {MAX_BLOB_BYTES} bytes. Each chunk can be used without the others.",
+)
+
 FRAME_ADDRESSES = (FRAME, POSE, SIGMA, POSE_SCALAR, SIGMA_SCALAR, QUALITY)
 INFO_ADDRESSES = (INFO, COILS, SPEAKER, MEAN, SPREAD)
 STATE_ADDRESSES = (LATENCY, COIL_STATES, TAKE)
 ADDRESSES = FRAME_ADDRESSES + INFO_ADDRESSES + STATE_ADDRESSES
+EXTRA_ADDRESSES = (EXTRA, COIL, SHAPE, UNIT, LOW, HIGH, CONTACT, GAP, MESH)
 
 
 @dataclass(frozen=True)
@@ -192,7 +298,7 @@ class ControlForm:
 
 
 _NAME = Argument("name", "s")
-_ON = Argument("1 or 0", "i")
+_ON = Argument("1 or 0", "i", limits=(0, 1))
 _WORD = Argument("start or stop", "s")
 _MARKER = Argument("text", "s")
 
@@ -217,13 +323,13 @@ CONTROL_FORMS = (
 
 def find_address(path: str) -> Address | None:
     """The row that a received path belongs to, None for a path of someone else's."""
-    return next((address for address in ADDRESSES if address.matches(path)), None)
+    return next((address for address in ADDRESSES + EXTRA_ADDRESSES if address.matches(path)), None)
 
 
-def address_table() -> str:
-    """The table in Markdown."""
+def address_table(rows: Iterable[Address]) -> str:
+    """A table in Markdown."""
     lines = ["| address | types | arguments | sent | meaning |", "|---|---|---|---|---|"]
-    for row in ADDRESSES:
+    for row in rows:
         arguments = ", ".join(map(str, row.arguments))
         lines.append(f"| `{row.path}` | `{row.type_tags}` | {arguments} | {row.when} | {row.meaning} |")
     return "\n".join(lines)
@@ -246,7 +352,8 @@ This page is made by `tonguetrack monitor --addresses > docs/osc.md`; change it 
 `tracker/streams/addresses.py`.
 
 `tonguetrack live`, `tonguetrack demo` and `tonguetrack track --osc HOST:PORT` send OSC 1.0 over UDP, by default
-to 127.0.0.1:9000.
+to 127.0.0.1:9000. What else can be sent, and to whom: [streams.md](streams.md); all protocols in detail:
+[protocols.md](protocols.md).
 Every frame is one bundle, every bundle one datagram of at most {MAX_DATAGRAM_BYTES} bytes. All time tags are
 "immediately"; when a frame was captured is an argument. Nothing is expected back: a receiver that is absent,
 late or slow changes nothing for the sender.
@@ -259,7 +366,7 @@ and in Python `load_model(path).for_speaker(speaker).vertices(pose)`, in mm. K i
 from the number of arguments. Ignore addresses that you do not know, and arguments beyond those listed; later
 versions may add both. `tonguetrack monitor` shows what arrives, and names what it does not know.
 
-{address_table()}
+{address_table(ADDRESSES)}
 
 K: coefficients of the pose; m: weights of the speaker; n: coils; m and n may be 0. `<k>` counts from 0. The
 one-value addresses are left out when a frame would not fit otherwise (K above 18).
@@ -286,7 +393,20 @@ No argument is ever NaN or infinite. The time is a 32-bit float: exact to 0.25 m
 4 ms within the first day; the sequence number is exact and begins again at 0 after 2^31 frames.
 A sequence number of 0 is the start of a stream.
 
-A receiver in Python, with python-osc:
+## More, where asked for
+
+A target with `send=` gets more than that, in datagrams of its own from a port of its own:
+`--to 'osc://127.0.0.1:9000?send=coils,shapes,unit,contact,mesh'`, or as many of these words as wanted.
+[streams.md](streams.md) shows how targets are written.
+
+{address_table(EXTRA_ADDRESSES)}
+
+A name in an address has letters, digits and `_.-` only; anything else in the name of a coil or shape becomes `_`.
+Model frame: x to the speaker's left, y from front to back, z up.
+
+## A receiver
+
+In Python, with python-osc:
 
 ```python
 from pythonosc.dispatcher import Dispatcher

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from pythonosc.osc_message_builder import OscMessageBuilder
+
 from ..control import Control, ControlKind, ControlQueue
 from .addresses import (
     CONTROL_MARKERS,
@@ -61,6 +63,28 @@ def _take(kind: ControlKind, rest: list[object], time_ns: int) -> Control | None
         case [str() as name] if _PLAIN_NAME.fullmatch(name):
             return Control(kind, name if kind == "take_start" else "", time_ns)
     return None
+
+
+def control_message(control: Control) -> bytes:
+    """The datagram that asks for it. Raises ValueError for a text that `control_of` would not take, and for "quit",
+    which is asked for elsewhere."""
+    match control.kind:
+        case "mark":
+            path, values = CONTROL_MARKERS[0], [control.text]
+        case "take_start":
+            path, values = CONTROL_TAKE, ["start", control.text] if control.text else ["start"]
+        case "take_stop":
+            path, values = CONTROL_TAKE, ["stop"]
+        case "fix_speaker" | "free_speaker":
+            path, values = CONTROL_SPEAKER, [control.kind.removesuffix("_speaker")]
+        case other:
+            raise ValueError(f"no message asks for {other}")
+    if control_of(path, list(values), control.time_ns) is None:
+        raise ValueError(f"'{control.text[:MAX_CONTROL_TEXT]}' would not be obeyed")
+    builder = OscMessageBuilder(path)
+    for value in values:
+        builder.add_arg(value, "s")
+    return bytes(builder.build().dgram)
 
 
 class OscControl:

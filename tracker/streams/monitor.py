@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,12 +12,18 @@ from pythonosc.osc_packet import OscPacket, ParseError
 
 from ..latency import NS_PER_MS, LogHistogram, latency_histogram, percentiles_text
 from ..pose import CoilState
-from .addresses import COIL_STATES, COILS, FRAME, INFO, LATENCY, QUALITY, TAKE, Address, find_address
+from .addresses import COIL_STATES, COILS, FRAME, INFO, LATENCY, QUALITY, TAKE, Address
+from .protocols import known_address
+from .vmc import VMC_VALUE
+from .vocabularies import NamedValues, Vocabulary
+from .vrchat import PARAMETER, UNIFIED, parameter_prefixes
 
 MAX_BYTES = 8192
 """Longer datagrams are counted and not taken apart: ours have at most 1400 bytes."""
 MAX_DEPTH = 4
 MAX_UNKNOWN = 64
+MAX_SEEN = 512
+"""Addresses with a name in them are as many as a sender likes."""
 MAX_SENDERS = 16
 RESTART_DISTANCE = 1000
 """A sequence number this far back begins a new stream; nearer, the datagram was overtaken."""
@@ -123,15 +129,22 @@ class Seen:
 class Monitor:
     """Statistics of everything that arrived. Memory is bounded, whatever is sent.
 
-    tell: called with one sentence when a stream starts, changes or an unknown address first appears.
+    tell: called with one sentence when a stream starts, changes or an unknown address first appears. vocabularies:
+    preset -> its names, which the names of blend shapes and avatar parameters are held against.
     """
 
-    def __init__(self, tell: Callable[[str], object] = lambda sentence: None) -> None:
+    def __init__(
+        self,
+        tell: Callable[[str], object] = lambda sentence: None,
+        vocabularies: Mapping[str, Vocabulary] | None = None,
+    ) -> None:
         self.tell = tell
+        self.named = NamedValues(vocabularies or {})
         self.datagrams = 0
         self.bytes = 0
         self.malformed = 0
         self.seen: dict[str, Seen] = {}
+        self.seen_beyond = 0
         self.unknown: dict[str, int] = {}
         self.unknown_beyond = 0
         self.streams: dict[Sender, Stream] = {}
@@ -153,9 +166,12 @@ class Monitor:
             self._message(path, values, sender, now_ns)
 
     def _message(self, path: str, values: list[object], sender: Sender, now_ns: int) -> None:
-        row = find_address(path)
+        row = known_address(path)
         if row is None:
             self._unknown(path, sender)
+            return
+        if path not in self.seen and len(self.seen) == MAX_SEEN:
+            self.seen_beyond += 1
             return
         seen = self.seen.setdefault(path, Seen(first_ns=now_ns))
         seen.count += 1
@@ -178,6 +194,16 @@ class Monitor:
             self._said(row, _coil_states_text(coils, values), sender)
         elif row is TAKE:
             self._said(row, _take_text(values), sender)
+        elif row is VMC_VALUE:
+            self._named(str(values[0]), values[1], sender)
+        elif row is PARAMETER:
+            self._named(row.name_in(path), values[0], sender)
+
+    def _named(self, name: str, value: Any, sender: Sender) -> None:
+        prefix = next((prefix for prefix in parameter_prefixes(UNIFIED) if name.startswith(prefix)), "")
+        words = self.named.add(_printable(name.removeprefix(prefix)), value)
+        if words:
+            self._tell(f"{_shown(sender)}: {words}")
 
     def _said(self, row: Address, words: str, sender: Sender) -> None:
         """Tells what became of the coils or the take, where it is another than before."""
@@ -256,6 +282,8 @@ class Monitor:
                 }
                 for path, seen in sorted(self.seen.items())
             },
+            "addresses_beyond": self.seen_beyond,
+            "names": self.named.as_dict(),
             "unknown": dict(sorted(self.unknown.items())),
             "unknown_beyond": self.unknown_beyond,
         }
@@ -283,6 +311,9 @@ class Monitor:
             misfits = f"  ({seen.misfits} with other arguments)" if seen.misfits else ""
             last = " ".join(_short(value) for value in seen.last[:8]) + (" ..." if len(seen.last) > 8 else "")
             lines.append(f"{path:<{width}}  {seen.count:7d} {rate}  {last}{misfits}")
+        if self.seen_beyond:
+            lines.append(f"further addresses: {self.seen_beyond} messages")
+        lines += self.named.lines()
         lines += [f"unknown    {name}: {count}" for name, count in sorted(self.unknown.items())]
         if self.unknown_beyond:
             lines.append(f"unknown    further addresses: {self.unknown_beyond}")
@@ -328,8 +359,10 @@ def _printable(text: str) -> str:
 def _plain(value: object) -> object:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
     return value if isinstance(value, int) else _printable(str(value))
 
 
 def _short(value: object) -> str:
-    return f"{value:.3f}" if isinstance(value, float) else _printable(str(value))
+    return f"{value:.3f}" if isinstance(value, float) else _printable(str(_plain(value)))

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import errno
 import socket
-import struct
 import time
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
-from pythonosc.osc_message_builder import OscMessageBuilder
 
 from ... import InputError
 from ..pose import FloatArray, TrackedPose
@@ -39,15 +35,21 @@ from .addresses import (
     SPEAKER_FREE,
     SPREAD,
     TAKE,
-    Address,
+)
+from .packing import (
+    BUNDLE_HEADER_BYTES,
+    ELEMENT_HEADER_BYTES,
+    SEQUENCE_MASK,
+    PackedBundle,
+    bundle_bytes,
+    in_datagrams,
+    osc_bundle,
+    osc_message,
+    osc_text,
 )
 from .sink import LiveNumbers, StreamInfo
 
 DEFAULT_DESTINATION = "127.0.0.1:9000"
-MAX_NAME_LENGTH = 120
-_BUNDLE_HEADER_BYTES = 16
-_ELEMENT_HEADER_BYTES = 4
-_SEQUENCE_MASK = 0x7FFF_FFFF
 
 
 class FrameBundle:
@@ -65,52 +67,34 @@ class FrameBundle:
             for k in range(size)
         ]
         tail = [(QUALITY.path, QUALITY, [0.0, 0, 0.0])]
-        messages = [_message(row, values, path) for path, row, values in head + scalars + tail]
-        self.has_scalars = _bundle_bytes(messages) <= MAX_DATAGRAM_BYTES
+        messages = [osc_message(row, values, path) for path, row, values in head + scalars + tail]
+        self.has_scalars = bundle_bytes(messages) <= MAX_DATAGRAM_BYTES
         if not self.has_scalars:
-            messages = [_message(row, values, path) for path, row, values in head + tail]
-        if _bundle_bytes(messages) > MAX_DATAGRAM_BYTES:
+            messages = [osc_message(row, values, path) for path, row, values in head + tail]
+        if bundle_bytes(messages) > MAX_DATAGRAM_BYTES:
             raise InputError(
-                f"{size} coefficients need {_bundle_bytes(messages)} bytes a frame, but an OSC datagram here has "
+                f"{size} coefficients need {bundle_bytes(messages)} bytes a frame, but an OSC datagram here has "
                 f"at most {MAX_DATAGRAM_BYTES}; use a model with fewer pose modes."
             )
-        self.datagram = bytearray(_bundle(messages))
-        # One format for the whole datagram: what never changes is packed as bytes, between the numbers. After the
-        # pause between two frames that takes a third of the time of writing through arrays.
-        layout, at = ">", 0
-        self._parts: list[bytes | float] = []
-        self._places: list[int] = []
-        end = _BUNDLE_HEADER_BYTES
-        for message, tags in zip(messages, self._number_tags(size), strict=True):
-            end += _ELEMENT_HEADER_BYTES + len(message)
-            numbers_at = end - 4 * len(tags)
-            layout += f"{numbers_at - at}s{tags}"
-            self._parts.append(bytes(self.datagram[at:numbers_at]))
-            self._places.append(len(self._parts))
-            self._parts += [0.0] * len(tags)
-            at = end
-        self._pack_into = struct.Struct(layout).pack_into
-        self._scalars = slice(self._places[3], self._places[3] + 4 * size, 2) if self.has_scalars else None
-
-    def _number_tags(self, size: int) -> list[str]:
-        """The numbers at the end of each message, all of 4 bytes."""
-        scalars = ["f"] * (2 * size) if self.has_scalars else []
-        return ["ifi", "f" * size, "f" * size, *scalars, "fif"]
+        self._packed = PackedBundle(messages)
+        self.datagram = self._packed.datagram
+        places = self._packed.places
+        self._scalars = slice(places[3], places[3] + 4 * size, 2) if self.has_scalars else None
 
     def write(self, pose: TrackedPose, sequence: int, time_s: float, latency_ms: float) -> None:
         """sequence: wraps to 0 after 2^31 - 1; time_s: since the stream's start."""
-        parts, places = self._parts, self._places
+        parts, places = self._packed.parts, self._packed.places
         weights, normalised = pose.weights.tolist(), pose.normalised.tolist()
         size = len(weights)
         frame, vector, sigma, quality = places[0], places[1], places[2], places[-1]
-        parts[frame : frame + 3] = sequence & _SEQUENCE_MASK, time_s, pose.status
+        parts[frame : frame + 3] = sequence & SEQUENCE_MASK, time_s, pose.status
         parts[vector : vector + size] = weights
         parts[sigma : sigma + size] = normalised
         if self._scalars is not None:
             parts[self._scalars] = weights + normalised
         residual = pose.residual_mm if pose.valid_coils else NO_RESIDUAL
         parts[quality : quality + 3] = residual, pose.valid_coils, latency_ms
-        self._pack_into(self.datagram, 0, *parts)
+        self._packed.pack()
 
 
 def info_datagrams(info: StreamInfo) -> list[bytes]:
@@ -118,39 +102,28 @@ def info_datagrams(info: StreamInfo) -> list[bytes]:
     about = [
         PROTOCOL_NAME,
         PROTOCOL_VERSION,
-        _osc_text(info.model_name),
-        _osc_text(info.model_fingerprint),
+        osc_text(info.model_name),
+        osc_text(info.model_fingerprint),
         info.vertex_count,
         len(info.mean),
         SPEAKER_FIXED if info.speaker_fixed else SPEAKER_FREE,
         info.rate_hz,
     ]
     messages = [
-        _message(SPEAKER, info.speaker_weights.tolist()),
-        _message(INFO, about),
-        _message(COILS, [_osc_text(role) for role in info.roles]),
-        _message(MEAN, info.mean.tolist()),
-        _message(SPREAD, info.sigma.tolist()),
+        osc_message(SPEAKER, info.speaker_weights.tolist()),
+        osc_message(INFO, about),
+        osc_message(COILS, [osc_text(role) for role in info.roles]),
+        osc_message(MEAN, info.mean.tolist()),
+        osc_message(SPREAD, info.sigma.tolist()),
     ]
-    groups: list[list[bytes]] = [[]]
-    for message in messages:
-        if _bundle_bytes([message]) > MAX_DATAGRAM_BYTES:
-            path = message.split(b"\0", 1)[0].decode()
-            raise InputError(
-                f"the message {path} needs {len(message)} bytes, more than an OSC datagram of "
-                f"{MAX_DATAGRAM_BYTES} holds; use a model or session with fewer entries."
-            )
-        if _bundle_bytes([*groups[-1], message]) > MAX_DATAGRAM_BYTES:
-            groups.append([])
-        groups[-1].append(message)
-    return [_bundle(group) for group in groups]
+    return [osc_bundle(group) for group in in_datagrams(messages)]
 
 
 class CoilStatesDatagram:
     """The datagram with the state of every coil; `write` replaces the numbers in place and says whether one changed."""
 
     def __init__(self, coils: int) -> None:
-        datagram = bytearray(_bundle([_message(COIL_STATES, [0] * coils)]))
+        datagram = bytearray(osc_bundle([osc_message(COIL_STATES, [0] * coils)]))
         if len(datagram) > MAX_DATAGRAM_BYTES:
             raise InputError(
                 f"the states of {coils} coils need {len(datagram)} bytes, more than an OSC datagram of "
@@ -177,11 +150,11 @@ def numbers_datagram(numbers: LiveNumbers) -> bytes:
     pairs = (numbers.device_to_host_ms, numbers.host_to_solved_ms, numbers.solved_to_sent_ms)
     latencies = [NO_LATENCY if value is None else value for pair in pairs for value in pair]
     take = [
-        _osc_text(numbers.take_path, cut_front=True),
-        min(numbers.take_frames, _SEQUENCE_MASK),
-        _osc_text(numbers.take_failure),
+        osc_text(numbers.take_path, cut_front=True),
+        min(numbers.take_frames, SEQUENCE_MASK),
+        osc_text(numbers.take_failure),
     ]
-    return _bundle([_message(LATENCY, latencies), _message(TAKE, take)])
+    return osc_bundle([osc_message(LATENCY, latencies), osc_message(TAKE, take)])
 
 
 class OscSink:
@@ -228,8 +201,8 @@ class OscSink:
         self._speaker_words = None
         if count and not info.speaker_fixed:
             # The speaker's message is the first: its weights end where its element ends.
-            element = int.from_bytes(self._info[0][_BUNDLE_HEADER_BYTES:][:_ELEMENT_HEADER_BYTES], "big")
-            end = _BUNDLE_HEADER_BYTES + _ELEMENT_HEADER_BYTES + element
+            element = int.from_bytes(self._info[0][BUNDLE_HEADER_BYTES:][:ELEMENT_HEADER_BYTES], "big")
+            end = BUNDLE_HEADER_BYTES + ELEMENT_HEADER_BYTES + element
             self._speaker_words = np.frombuffer(self._info[0], ">f4")[end // 4 - count : end // 4]
         self._send_info()
 
@@ -321,37 +294,3 @@ def listening_socket(address: str, option: str) -> socket.socket:
             f"{address}: cannot listen there ({reason.strerror}); give another {option}."
         ) from reason
     return receiver
-
-
-def _message(row: Address, values: Iterable[Any], path: str = "") -> bytes:
-    """One OSC message for a row of the table; `path` where the row's holds a <k>."""
-    builder = OscMessageBuilder(path or row.path)
-    values = list(values)
-    tags = [argument.tag for argument in row.arguments]
-    if row.arguments[-1].count:
-        tags[-1:] = tags[-1:] * (len(values) - len(tags) + 1)
-    for value, tag in zip(values, tags, strict=True):
-        builder.add_arg(value, tag)
-    return bytes(builder.build().dgram)
-
-
-def _bundle_bytes(messages: Sequence[bytes]) -> int:
-    return _BUNDLE_HEADER_BYTES + sum(_ELEMENT_HEADER_BYTES + len(message) for message in messages)
-
-
-def _bundle(messages: Sequence[bytes]) -> bytes:
-    from pythonosc.osc_message import OscMessage
-
-    builder = OscBundleBuilder(IMMEDIATELY)
-    for message in messages:
-        builder.add_content(OscMessage(message))
-    return bytes(builder.build().dgram)
-
-
-def _osc_text(text: str, cut_front: bool = False) -> str:
-    """OSC strings are ASCII without zeros; names of people's files are cut to what a datagram bears."""
-    plain = text.encode("ascii", "replace").decode().replace("\0", "?")
-    if len(plain) <= MAX_NAME_LENGTH:
-        return plain
-    kept = MAX_NAME_LENGTH - 3
-    return "..." + plain[-kept:] if cut_front else plain[:kept] + "..."

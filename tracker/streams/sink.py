@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
 
 from ..pose import FloatArray, TrackedPose
+
+if TYPE_CHECKING:
+    from ...model.multilinear import TongueModel
 
 
 @dataclass(frozen=True)
@@ -25,6 +29,22 @@ class StreamInfo:
     speaker_fixed: bool
     roles: tuple[str, ...]
     rate_hz: float
+
+
+@dataclass(frozen=True)
+class StreamContext:
+    """What a stream may know of a run beyond `StreamInfo`, to turn weights into shapes, points and distances.
+
+    palate: (p, 3) mm in the model frame, from front to back, or None; ranges: of the speaker's avatar shapes, name ->
+    lowest and highest value, empty where they were never measured; name: of the stream, for people and receivers;
+    control: HOST:PORT where the run takes control messages over OSC, "" = nowhere.
+    """
+
+    model: TongueModel
+    palate: FloatArray | None = None
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    name: str = "tonguetrack"
+    control: str = ""
 
 
 Pair = tuple[float | None, float | None]

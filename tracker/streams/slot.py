@@ -15,7 +15,7 @@ from .sink import StreamInfo
 CLOSE_S = 2.0
 """So long `close` waits for a worker that is at work; one that hangs for longer is left behind."""
 LONGEST_NAP_S = 0.1
-"""A worker without a rate looks at least this often whether it is over."""
+"""A worker looks at least this often whether it is over."""
 AGAIN_S = 1.0
 """So long after `begin` failed it is tried again."""
 
@@ -44,23 +44,29 @@ class SlotSink:
     pose, as long as the worker is fast enough. `dropped` counts the poses that the worker could not hand on and
     those that a newer one replaced because it did not come in time; poses that are left out for the sake of the
     rate are no loss. `failure` says why it last failed, "" = it did not, or has recovered.
-    said: called once for each new failure, in the worker's thread.
+    said: called once for each new failure, in the worker's thread. waiting: so many poses may wait at a time; 1 for what
+    is looked at, more for what is recorded, where frames that come in a burst are no reason for a loss.
     """
 
     def __init__(
-        self, worker: Worker, rate_hz: float | None = None, said: Callable[[str], None] = lambda text: None
+        self,
+        worker: Worker,
+        rate_hz: float | None = None,
+        said: Callable[[str], None] = lambda text: None,
+        waiting: int = 1,
     ) -> None:
         self._worker = worker
+        self._waiting = waiting
         self._said = said
         self._period_s = None if rate_hz is None else 1.0 / rate_hz
         self.sent = 0
         self.dropped = 0
         self.failure = ""
-        # Three poses: one is being worked on, one waits, one is being written. Each is in one deque or in one
+        # One pose is being worked on, one is being written, the others wait. Each is in one deque or in one
         # thread's hands; taking from a deque and adding to it are atomic, so that the loop needs no lock.
         self._free: deque[TrackedPose] = deque()
         self._newest: deque[TrackedPose] = deque()
-        self._news: deque[StreamInfo] = deque(maxlen=1)
+        self._info: StreamInfo | None = None  # the newest
         self._wake = threading.Event()
         self._over = False
         self._due_s = 0.0  # when the worker will look next
@@ -71,13 +77,13 @@ class SlotSink:
         return self._worker.destination
 
     def start(self, info: StreamInfo) -> None:
-        self._news.append(info)
+        self._info = info
         self._over = False
         self._thread = threading.Thread(target=self._run, name=f"to {self.destination}", daemon=True)
         self._thread.start()
 
     def change(self, info: StreamInfo) -> None:
-        self._news.append(info)
+        self._info = info
         self._wake.set()
 
     def send(self, pose: TrackedPose) -> None:
@@ -87,13 +93,14 @@ class SlotSink:
             kept.take(pose)
         except IndexError:  # the first poses of a run
             kept = pose.copy()
-        try:
-            self._free.append(self._newest.popleft())
-        except IndexError:
-            pass
-        else:
-            if self._period_s is None or time.perf_counter() > self._due_s + self._period_s:
-                self.dropped += 1
+        if len(self._newest) >= self._waiting:
+            try:
+                self._free.append(self._newest.popleft())
+            except IndexError:  # the worker has just taken it
+                pass
+            else:
+                if self._period_s is None or time.perf_counter() > self._due_s + self._period_s:
+                    self.dropped += 1
         self._newest.append(kept)
         if self._period_s is None and not self._wake.is_set():
             self._wake.set()
@@ -106,19 +113,21 @@ class SlotSink:
             self._thread.join(CLOSE_S)
 
     def _run(self) -> None:
+        told: StreamInfo | None = None
         begun, again_s = False, 0.0
         self._due_s = time.perf_counter()
         while True:
             over = self._over
-            if self._news and time.perf_counter() >= again_s:
-                info = self._news.popleft()
+            info = self._info
+            if info is not None and info is not told and time.perf_counter() >= again_s:
                 begun = self._try(partial(self._worker.begin, info))
-                if not begun:
+                if begun:
+                    told = info
+                else:
                     again_s = time.perf_counter() + AGAIN_S
-                    if not self._news:
-                        self._news.append(info)
             if begun:
-                self._work()
+                for _ in range(self._waiting):
+                    self._work()
             if over:
                 break
             self._rest()
@@ -145,8 +154,9 @@ class SlotSink:
         # By the clock and not by naps, so that the rate is the one that was asked for.
         now_s = time.perf_counter()
         self._due_s = max(self._due_s + self._period_s, now_s)
-        if self._due_s > now_s:
-            time.sleep(self._due_s - now_s)
+        while not self._over and (left_s := self._due_s - time.perf_counter()) > 0:
+            self._wake.wait(min(left_s, LONGEST_NAP_S))
+            self._wake.clear()
 
     def _try(self, action: Callable[[], None]) -> bool:
         """Whatever a peer does must not end the thread: its stream goes on when it recovers."""

@@ -1,0 +1,81 @@
+"""Motion transfer: what one speaker's tongue did, on another speaker's anatomy.
+
+The pose weights say what a tongue does and the speaker weights whose it is (paper, section "Multilinear model"), so
+the poses of one speaker with the speaker weights of another are the same motion in another mouth. What was measured
+on the first speaker does not go with it: coils and residuals of transferred poses are missing, energies unknown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from .. import InputError
+from ..model.multilinear import TongueModel
+from .palate import Palate
+from .pose import FloatArray, TrackedPoses
+from .session import load_session
+
+
+@dataclass(frozen=True)
+class OtherSpeaker:
+    """weights: (m,) raw; palate: of that speaker, in the model's frame, where it is known; source: for people."""
+
+    weights: FloatArray
+    palate: Palate | None
+    source: str
+
+
+def other_speaker(text: str, model: TongueModel) -> OtherSpeaker:
+    """A speaker from the command line: a session file with [speaker] weights, or the raw weights with commas between.
+
+    Raises InputError where it is neither, or does not belong to the model.
+    """
+    if not text.lower().endswith(".toml"):
+        return OtherSpeaker(_checked(_numbers(text), model, f"--speaker {text}"), None, "the weights given")
+    session = load_session(Path(text))
+    if session.speaker_weights is None:
+        raise InputError(
+            f"{text}: it has no [speaker] weights; write them with 'tonguetrack track RECORDING --save-session {text}'."
+        )
+    if session.model_fingerprint not in ("", model.fingerprint):
+        raise InputError(
+            f"{text}: its speaker belongs to the model [{session.model_fingerprint}], the poses to {model.name} "
+            f"[{model.fingerprint}]; fit the speaker with the poses' model."
+        )
+    weights = _checked(session.speaker_weights, model, f"{text}: [speaker] weights")
+    return OtherSpeaker(weights, session.palate, f"the speaker of {text}")
+
+
+def transferred(poses: TrackedPoses, speaker: OtherSpeaker) -> TrackedPoses:
+    """The same motion in the other speaker's mouth."""
+    return replace(
+        poses,
+        speaker_weights=np.tile(speaker.weights, (poses.frame_count, 1)),
+        energies=np.full(poses.frame_count, np.nan),
+        residual_mm=np.full(poses.frame_count, np.nan),
+        residuals_mm=np.full_like(poses.residuals_mm, np.nan),
+        coils=np.full_like(poses.coils, np.nan),
+        vertices=None,
+        experiment=2,
+    )
+
+
+def _numbers(text: str) -> FloatArray:
+    try:
+        return np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        raise InputError(
+            f"--speaker {text}: expected a session file ending in .toml, or raw speaker weights with commas between "
+            "them (--speaker=0.1,-0.2,...)."
+        ) from None
+
+
+def _checked(weights: FloatArray, model: TongueModel, where: str) -> FloatArray:
+    if weights.shape != (model.speaker.size,) or not np.isfinite(weights).all():
+        raise InputError(
+            f"{where}: {weights.size} weights; the model {model.name} needs {model.speaker.size}, all finite."
+        )
+    return weights
