@@ -39,6 +39,8 @@ TRACK_DEMO = ".venv/bin/tonguetrack track recordings/demo.csv --session recordin
 RENDER_DEMO = ".venv/bin/tonguetrack render demo.poses.csv --session recordings/demo.session.toml"
 DEMO = ".venv/bin/tonguetrack demo --seconds 5 --to "
 WITHOUT_END = ELSEWHERE + "test_window.py and test_page_browser.py, and .ci/run for some seconds"
+HEADS = ".venv/bin/tonguetrack mri phantom heads --speakers 1 --seed 7"
+BY_MODEL_TESTS = ELSEWHERE + "test_model_evaluation.py, with fewer samples"
 BY_FAULTS = ELSEWHERE + "test_cli_live_devices.py and the simulators' own tests: it runs until it is ended"
 
 README = {
@@ -95,6 +97,18 @@ DOCS = {
     FIRST_TAKE: HERE,
     ".venv/bin/tonguetrack doctor": ELSEWHERE + "test_doctor.py, where what is found may be anything",
     ".venv/bin/tonguetrack devices": HERE,
+    HEADS: HERE,
+    ".venv/bin/tonguetrack mri denoise heads/scans/Speaker01_a.nii.gz -o smooth.nii.gz": HERE,
+    ".venv/bin/tonguetrack mri segment smooth.nii.gz -o tissue.nii.gz": HERE,
+    ".venv/bin/tonguetrack mri cloud smooth.nii.gz -o surface.ply": HERE,
+    ".venv/bin/tonguetrack mri slice smooth.nii.gz -o slice.png --at 2.2 --cloud surface.ply": HERE,
+    ".venv/bin/tonguetrack model evaluate speakers/samples.yaml -o report": BY_MODEL_TESTS,
+    (
+        ".venv/bin/tonguetrack model evaluate PATH/sampleDatabase.yaml --specificity --samples 20000 "
+        "--region-file combined=PATH/combined.json -o report"
+    ): BY_MODEL_TESTS,
+    ".venv/bin/tonguetrack model fit ultrax.npz tongue.ply -o fitted.ply": ELSEWHERE
+    + "test_cli_model_fit.py",
     ".venv/bin/pip install '.[viewer]'": BY_CI,
     ".venv/bin/pip install '.[web]'": BY_CI,
     ".venv/bin/python tests/bench/rendering.py": "by hand, where nothing else runs",
@@ -220,6 +234,13 @@ def test_the_flags_that_pages_name_exist():
         "monitor",
         "bench",
         "model build",
+        "model evaluate",
+        "model fit",
+        "mri phantom",
+        "mri denoise",
+        "mri segment",
+        "mri cloud",
+        "mri slice",
         "simulate recording",
         "simulate device",
         "live",
