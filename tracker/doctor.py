@@ -23,7 +23,18 @@ from .. import __version__
 State = Literal["ok", "note", "problem"]
 
 OLDEST_PYTHON = (3, 11)
-REQUIRED = ("numpy", "scipy", "numba", "python-osc", "pyserial", "pyyaml", "tomlkit", "trimesh", "rich")
+REQUIRED = (
+    "numpy",
+    "scipy",
+    "numba",
+    "python-osc",
+    "pyserial",
+    "pyyaml",
+    "tomlkit",
+    "trimesh",
+    "rich",
+    "joblib",
+)
 EXTRAS = {
     "lab": (("pylsl", "pyxdf"), "Lab Streaming Layer, reading XDF files of others"),
     "plot": (("matplotlib",), "pictures"),
