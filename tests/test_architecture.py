@@ -179,7 +179,7 @@ def test_the_viewer_knows_nothing_of_how_poses_are_made():
 
 def test_only_the_live_loop_its_status_and_its_measurement_know_of_streams():
     """The tracker's results flow to the streams; nothing that computes them looks back."""
-    loop = {f"tonguetrack.tracker.{name}" for name in ("live", "status", "bench")}
+    loop = {f"tonguetrack.tracker.{name}" for name in ("live", "rehearsal", "status", "bench")}
     offences(
         [
             f"{SOURCES[name].path}:{found.line} imports {found.module}"

@@ -168,6 +168,7 @@ class Script:
 
     rate_hz = 0.0
     frame = FrameOfReference()
+    unasked = True
 
     def __init__(self, items, coils=COILS):
         self.coils = coils

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from ..drivers.devices.clock import LONGEST_GAP_S
+from ..drivers.devices.source import DeviceSource
 from ..drivers.frames import CoilFrame, NoteKind, Recording, SourceNote
 from ..drivers.replay import ReplaySource
 from ..model.multilinear import TongueModel
@@ -18,6 +19,7 @@ from .control import Control, ControlQueue
 from .headcorrection import ReferenceState
 from .online import Tracker
 from .pose import PoseStatus, TrackedPose
+from .rehearsal import Rehearsal
 from .session import session_toml
 from .setup import Setup
 from .status import LiveStatus, Summary, summarise
@@ -126,6 +128,9 @@ class LiveRun:
         recorder: TakeRecorder | None = None
         changes = tracker.changes
         end = _End(self.seconds, 1.0 / self.source.rate_hz if self.source.rate_hz else tracker.period_s)
+        rehearsal = Rehearsal(tracker, sinks)
+        if isinstance(self.source, DeviceSource):
+            self.source.practise = rehearsal
         for item in self.source:
             if keeper is not None:
                 if status.frames == 0 and isinstance(item, CoilFrame):
@@ -141,6 +146,7 @@ class LiveRun:
                 if tracker.changes != changes:
                     changes = tracker.changes
                     self._pass_on(recorder, item.arrival_ns)
+                rehearsal.frame = item
                 before_ns = clock()
                 pose = step(item)
                 for sink in sinks:

@@ -6,6 +6,7 @@ it is told of, never on the host's clock: the same frames give the same bits aga
 
 from __future__ import annotations
 
+import copy
 import time
 from dataclasses import replace
 
@@ -122,6 +123,11 @@ class Tracker:
         self._without_s = 0.0
         self.pose.status = PoseStatus.LOST
         self._forget_average()
+
+    def twin(self) -> Tracker:
+        """Another tracker of the same kind and set-up, with a state of its own, that knows of no frame yet."""
+        setup = replace(self.setup, preparation=copy.deepcopy(self._preparation))
+        return Tracker(self.model, setup, self.rate_hz, self._watchful)
 
     def change(self, setup: Setup) -> None:
         """Goes on with another set-up: the speaker became known, or a client changed the energy.

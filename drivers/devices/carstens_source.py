@@ -52,6 +52,7 @@ class CarstensConversation:
         self.coils = coil_names(layout)
         self.rate_hz = min(rate_hz or USUAL_HZ, poll_hz)
         self.frame = FrameOfReference()
+        self.unasked = False
         self._link = link
         self._layout = layout
         self._sample_hz = rate_hz

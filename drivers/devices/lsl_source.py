@@ -145,6 +145,7 @@ class LslConversation:
         self.coils = channels.coils
         self.rate_hz = rate_hz
         self.frame = FrameOfReference()
+        self.unasked = True
         self._inlet = inlet
         self._channels = channels
         self._note = note

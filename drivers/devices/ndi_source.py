@@ -352,6 +352,7 @@ class NdiConversation:
 
     rate_hz = 0.0
     frame = FRAME_OF_REFERENCE
+    unasked = False
 
     def __init__(
         self, device: Device, coils: tuple[Coil, ...], prefers_bx: bool, line: SerialLine | None

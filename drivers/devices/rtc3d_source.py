@@ -60,6 +60,7 @@ class Rtc3dConversation:
     def __init__(self, link: Link, order: str = rtc3d.BIG, sensors: int = 0) -> None:
         self.frame = FRAME
         self.rate_hz = 0.0
+        self.unasked = True
         self._link = link
         self._order = order
         self._reader = rtc3d.PacketReader()

@@ -234,6 +234,14 @@ class OscSink:
             if self.numbers is not None:
                 self._send_aside(numbers_datagram(self.numbers()))
 
+    def rehearse(self, pose: TrackedPose) -> None:
+        """Writes a frame as `send` does, and sends nothing; the next frame is written over it."""
+        bundle = self._bundle
+        assert bundle is not None, "start() comes before rehearse()"
+        start_s = pose.device_time_s if self._start_s is None else self._start_s
+        now_ns = time.perf_counter_ns()
+        bundle.write(pose, self._sequence, pose.device_time_s - start_s, (now_ns - pose.arrival_ns) * 1e-6)
+
     def close(self) -> None:
         self._socket.close()
 
