@@ -45,7 +45,7 @@ FAR_FROM_PALATE_MM = 10.0  # from here on all distances look the same
 UNCERTAIN_MM = 3.0  # likewise
 LONGEST_TRAIL_S = 10.0
 BROKEN_TRAIL_S = 0.25  # longer without a moment, and a trail does not bridge it
-TRAIL_STEP_S = 0.01
+TRAIL_STEP_S = 0.02
 GRAIN_PX = 128
 HIDDEN = 0.3  # how much is seen of a mark behind the tongue
 

@@ -46,16 +46,17 @@ class Offscreen:
             return str(self._context.info["GL_RENDERER"])
 
     def picture(self, moment: Moment, view: View) -> NDArray[np.uint8]:
-        """(height, width, 3) red, green and blue, the upper row first."""
+        """(height, width, 3) red, green and blue, the upper row first: a view of what lies in memory with a fourth
+        value a pixel and the lower row first, for putting it in order costs as much as drawing all text."""
         with self._context:
             if self._smooth is None:
                 self.renderer.draw(moment, view, self._plain)
             else:
                 self.renderer.draw(moment, view, self._smooth)
                 self._context.copy_framebuffer(self._plain, self._smooth)
-            data = self._plain.read(components=3, alignment=1)
+            data = self._plain.read(components=4, alignment=1)
         width, height = self.size
-        return np.ascontiguousarray(np.frombuffer(data, dtype=np.uint8).reshape(height, width, 3)[::-1])
+        return np.frombuffer(data, dtype=np.uint8).reshape(height, width, 4)[::-1, :, :3]
 
     def _target(self, samples: int) -> moderngl.Framebuffer:
         context, size = self._context, self.size

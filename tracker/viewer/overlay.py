@@ -51,6 +51,7 @@ class Typeface:
         self.size_px = size_px
         self.line_px = round(1.35 * size_px)
         self.atlas = context.texture((ATLAS_PX, ATLAS_PX), 1, bytes(ATLAS_PX * ATLAS_PX), alignment=1)
+        self.atlas.filter = context.NEAREST, context.NEAREST  # a letter's pixels lie on the picture's
         self._row_px = round(1.5 * size_px)
         self._free = (1, 1)
         self._letters: dict[str, tuple[float, ...]] = {}
@@ -86,7 +87,7 @@ class Typeface:
         """(n, COLUMNS) the text's letters in black, its upper left corner at 0, 0."""
         letters = np.array([self._letter(letter) for letter in plain_letters(text)]).reshape(-1, 6)
         rows = np.zeros((len(letters), COLUMNS), dtype=np.float32)
-        rows[:, 0] = np.cumsum(letters[:, 0]) - letters[:, 0]
+        rows[:, 0] = np.rint(np.cumsum(letters[:, 0]) - letters[:, 0])
         rows[:, 2] = rows[:, 0] + letters[:, 1]
         rows[:, 3] = self._row_px
         rows[:, DEPTHS] = NEAREST_DEPTH
