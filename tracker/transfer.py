@@ -59,6 +59,7 @@ def transferred(poses: TrackedPoses, speaker: OtherSpeaker) -> TrackedPoses:
         residuals_mm=np.full_like(poses.residuals_mm, np.nan),
         coils=np.full_like(poses.coils, np.nan),
         vertices=None,
+        coil_states=None,
         experiment=2,
     )
 

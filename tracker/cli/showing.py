@@ -110,6 +110,7 @@ def _with_coils(poses: TrackedPoses, session: Session) -> TrackedPoses:
         correspondences=(),
         coils=np.zeros((frames, 0, 3)),
         residuals_mm=np.zeros((frames, 0)),
+        coil_states=None,
     )
 
 
