@@ -200,6 +200,20 @@ def test_a_page_is_told_what_it_must_know_and_then_shown_the_pose(server, feed):
     assert pose["vertices"] is None and pose["fixed"] and 0 < pose["age_ms"]
 
 
+def test_a_pose_whose_weights_are_no_numbers_never_reaches_a_page(server, feed):
+    feed.show([0.5, 0.0, 0.0, 0.0])
+    with Client(server) as client:
+        client.next("pose")
+        feed.show([np.nan, 0.0, 0.0, 0.0])
+        time.sleep(0.3)
+        feed.show([1.0, 0.0, 0.0, 0.0])
+        while True:
+            pose = client.next("pose")
+            assert np.isfinite(pose["weights"]).all()
+            if np.allclose(pose["weights"], feed.pose.weights, rtol=1e-6):
+                break
+
+
 def test_the_state_tells_what_the_run_says_of_itself(server, feed):
     feed.numbers = FeedNumbers(
         LiveNumbers((1.0, 2.0), (0.1, 0.2), (0.0, 0.1), "/x/take-007.xdf", 250, ""), ("no tip",)

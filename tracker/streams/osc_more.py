@@ -81,7 +81,7 @@ class MoreDatagrams:
             sequence, pose.frame_number & SEQUENCE_MASK, pose.device_time_s - self._start_s
         )
         yield from bundles_of(self._elements(pose), first)
-        if self._mesh is not None:
+        if self._mesh is not None and pose.has_shape:
             yield from self._mesh.datagrams(pose, sequence)
 
     def _elements(self, pose: TrackedPose) -> Iterator[bytes]:
@@ -89,12 +89,13 @@ class MoreDatagrams:
             if all(map(isfinite, place)):
                 yield message.element(*place)
         if self._shapes is not None:
-            yield from self._shapes.elements(pose)
+            if pose.has_shape:
+                yield from self._shapes.elements(pose)
             now_s = time.perf_counter()
             if now_s >= self._next_ranges_s:
                 self._next_ranges_s = now_s + INFO_PERIOD_S
                 yield from self._shapes.ranges()
-        if self._contact is not None:
+        if self._contact is not None and pose.has_shape:
             yield from self._contact.elements(pose)
 
 
