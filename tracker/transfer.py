@@ -16,7 +16,7 @@ from .. import InputError
 from ..model.multilinear import TongueModel
 from .palate import Palate
 from .pose import FloatArray, TrackedPoses
-from .session import load_session
+from .session import Session, load_session
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,11 @@ def other_speaker(text: str, model: TongueModel) -> OtherSpeaker:
         )
     weights = _checked(session.speaker_weights, model, f"{text}: [speaker] weights")
     return OtherSpeaker(weights, session.palate, f"the speaker of {text}")
+
+
+def session_of(speaker: OtherSpeaker) -> Session:
+    """What is known of that speaker, for whatever draws the transferred motion."""
+    return replace(Session(), speaker_weights=speaker.weights, palate=speaker.palate)
 
 
 def transferred(poses: TrackedPoses, speaker: OtherSpeaker) -> TrackedPoses:
