@@ -270,6 +270,14 @@ def test_poses_of_a_take_know_which_coils_counted(tmp_path):
     ]
 
 
+def test_frames_whose_weights_are_damaged_are_no_poses(tmp_path):
+    rows = rows_of(INFO, 6)
+    rows["pose"][2, 7] = np.nan
+    rows["pose"][4, 9] = np.inf
+    poses = read_take(written(tmp_path / "a.xdf", parts_of(INFO, rows))).poses()
+    np.testing.assert_array_equal(poses.weights, rows["pose"][[0, 1, 3, 5], 6:9])
+
+
 def test_markers_know_the_frame_from_which_they_hold(tmp_path):
     rows = rows_of(INFO, 30)
     at = stamps_of(rows)

@@ -136,6 +136,13 @@ class TrackedPoses:
         return len(self.times_s)
 
     @property
+    def have_shape(self) -> NDArray[np.bool_]:
+        """(frames,): whether all weights are numbers, so that there is a tongue."""
+        return np.asarray(
+            np.isfinite(self.weights).all(axis=1) & np.isfinite(self.speaker_weights).all(axis=1)
+        )
+
+    @property
     def tracked(self) -> NDArray[np.bool_]:
         """(frames,): True where at least one coil was there."""
         return np.asarray(self.statuses == PoseStatus.OK)

@@ -18,6 +18,9 @@ from .palate import Palate
 from .pose import FloatArray, TrackedPoses
 from .session import Session, load_session
 
+FARTHEST_SIGMA = 20.0
+"""Nobody's anatomy is as far from the mean as that; the tracker itself goes to 5."""
+
 
 @dataclass(frozen=True)
 class OtherSpeaker:
@@ -83,5 +86,11 @@ def _checked(weights: FloatArray, model: TongueModel, where: str) -> FloatArray:
     if weights.shape != (model.speaker.size,) or not np.isfinite(weights).all():
         raise InputError(
             f"{where}: {weights.size} weights; the model {model.name} needs {model.speaker.size}, all finite."
+        )
+    sigmas = np.abs(model.speaker.normalised(weights))
+    if sigmas.max() > FARTHEST_SIGMA:
+        raise InputError(
+            f"{where}: weight {int(sigmas.argmax()) + 1} is {sigmas.max():.3g} sigma from the mean, which is no tongue any "
+            f"more; expected {FARTHEST_SIGMA:g} at most, and most people are within 3."
         )
     return weights

@@ -243,14 +243,16 @@ class Take:
         )
 
     def poses(self) -> TrackedPoses:
-        """What the tracker made of the frames, without those whose poses are lost.
+        """What the tracker made of the frames, without those whose poses are lost or damaged beyond use.
 
         Raises InputError where there are none.
         """
         self._check_frames()
         info, pose = self.info, self.pose
         status = pose[:, POSE_HEAD.index("status")]
-        there = np.isin(status, [int(known) for known in PoseStatus])
+        first, last = len(POSE_HEAD), len(POSE_HEAD) + len(info.pose_mean) + info.speaker_size
+        shaped = np.isfinite(pose[:, first:last]).all(axis=1)
+        there = np.isin(status, [int(known) for known in PoseStatus]) & shaped
         if not there.any():
             raise InputError(f"{self.path}: the take has no poses.")
         times, rate_hz, _ = take_times(self.stamps, self.device_times, info.rate_hz, str(self.path))
