@@ -18,6 +18,7 @@ from strict_page import decoded
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from tonguetrack.tracker.cli import main
 from tonguetrack.tracker.streams.feed import FeedNumbers
 from tonguetrack.tracker.streams.page.protocol import WINDOW
 from tonguetrack.tracker.streams.sink import LiveNumbers
@@ -489,6 +490,15 @@ def test_without_websockets_the_extra_is_named(feed):
         str(feed.folder), "127.0.0.1:0", before="import sys; sys.modules['websockets'] = None; "
     )
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "tonguetrack[web]" in done.stderr
+
+
+def test_without_websockets_a_run_says_so_before_it_begins(capsys, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert main(["live", "gone:", "--web", "127.0.0.1:0"]) == 2
+    assert (
+        capsys.readouterr().err
+        == "tonguetrack: the page needs the extra 'web': pip install 'tonguetrack[web]'.\n"
+    )
 
 
 def test_at_the_end_of_the_run_the_pages_are_told_and_the_server_ends(tmp_path):

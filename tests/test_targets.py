@@ -9,6 +9,7 @@ import pytest
 from tonguetrack import InputError
 from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.cli import main
+from tonguetrack.tracker.cli.outputs import check_each_once
 from tonguetrack.tracker.pose import PoseStatus, TrackedPose
 from tonguetrack.tracker.streams.monitor import decode
 from tonguetrack.tracker.streams.sink import LiveNumbers, StreamContext, StreamInfo
@@ -238,3 +239,24 @@ def test_every_kind_says_what_it_is():
     for kind in KINDS:
         assert kind.form.startswith(f"{kind.scheme}:") and kind.words
         assert all(words for words in kind.options.values())
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--to", "vmc://127.0.0.1", "--to", "vmc://127.0.0.1:39540?rate=30"],
+        ["--to", "lsl:tongue", "--to", "lsl:tongue"],
+        ["--to", "osc://127.0.0.1:9000?send=mesh", "--osc", "127.0.0.1:9000"],
+        ["--osc", "127.0.0.1:9000", "--osc", "127.0.0.1:9000"],
+    ],
+)
+def test_a_target_that_is_named_twice_is_refused(flags, capsys):
+    assert main(["demo", "--seconds", "1", *flags]) == 2
+    told = capsys.readouterr().err
+    assert "is named twice" in told and told.count("\n") == 1
+
+
+def test_two_presets_may_go_to_one_avatar():
+    check_each_once(
+        (), [parse_target("vmc://127.0.0.1?preset=arkit"), parse_target("vmc://127.0.0.1?preset=unified")]
+    )

@@ -70,6 +70,7 @@ def outputs_of(args: argparse.Namespace, model: TongueModel, speaker: str | None
     osc = tuple(args.osc or ([] if targets else [DEFAULT_OSC]))
     for destination in osc:
         resolve(destination)
+    check_each_once(osc, targets)
     if args.web:
         check_page(args.web)
     if args.ghost and not args.view:
@@ -88,17 +89,36 @@ def outputs_of(args: argparse.Namespace, model: TongueModel, speaker: str | None
     return replace(outputs, other=other)
 
 
+def check_each_once(osc: Sequence[str], targets: Sequence[Target]) -> None:
+    """Raises InputError where one place would get the same twice: a receiver would take it for one confused stream."""
+    from ... import InputError
+    from ..streams.osc import parse_destination
+
+    named = [("osc", *parse_destination(text), "", "") for text in osc]
+    named += [(each.kind.scheme, each.host, each.port, each.name, each.preset) for each in targets]
+    for place in named:
+        if named.count(place) > 1:
+            scheme, host, port, name, _ = place
+            raise InputError(
+                f"{scheme} to {name or f'{host}:{port}'} is named twice; name each target once, with all its options."
+            )
+
+
 def makes_a_mesh(target: Target) -> bool:
     return target.kind.scheme == "oscquery" or "mesh" in target.send
 
 
 def check_page(address: str) -> None:
-    """Raises InputError where a server could not listen there: better now than after minutes of calibration."""
+    """Raises InputError where a server could not listen there, or the extra is missing: better now than after minutes of
+    calibration."""
     import socket
+    from importlib.util import find_spec
 
     from ... import InputError
     from ..streams.osc import resolve
 
+    if find_spec("websockets") is None:
+        raise InputError("the page needs the extra 'web': pip install 'tonguetrack[web]'.")
     family, place = resolve(address, lowest_port=0)
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         try:
