@@ -50,7 +50,7 @@ def test_what_draws_is_fed_the_other_anatomy_without_the_first_ones_coils(tmp_pa
     np.testing.assert_array_equal(shown.weights, tracked.weights)
     np.testing.assert_array_equal(shown.normalised, tracked.normalised)
     np.testing.assert_array_equal(shown.speaker_weights, other_weights())
-    assert shown.speaker_fixed and shown.coils.shape == (0, 3) and np.isnan(shown.residual_mm)
+    assert not shown.speaker_fixed and shown.coils.shape == (0, 3) and np.isnan(shown.residual_mm)
     assert (shown.frame_number, shown.device_time_s) == (7, tracked.device_time_s)
     np.testing.assert_array_equal(tracked.speaker_weights, model().speaker.mean)  # as it was
     assert (sink.sent, sink.dropped, sink.destination) == (1, 0, "feed")
