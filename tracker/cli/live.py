@@ -148,7 +148,7 @@ def speakers(texts: Sequence[str]) -> tuple[str, str | None]:
             f"--speaker {shown[0]}: expected mean or joint, how the speaker is estimated; or on whose anatomy the tongue is "
             "shown: a session file ending in .toml, or raw speaker weights with commas between them."
         )
-    return (estimators or ["mean"])[0], (shown or [None])[0]
+    return estimators[0] if estimators else "mean", shown[0] if shown else None
 
 
 def follow(job: Job, source: Source) -> int:
