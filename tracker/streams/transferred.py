@@ -50,7 +50,8 @@ class TransferredSink:
         moved.valid_coils, moved.status = pose.valid_coils, pose.status
         moved.device_time_s, moved.frame_number = pose.device_time_s, pose.frame_number
         moved.arrival_ns, moved.solved_ns = pose.arrival_ns, pose.solved_ns
-        moved.speaker_fixed = pose.speaker_fixed  # what can be asked for is to fix or free the one who is tracked
+        # What a user can ask for is to fix or free the one who is tracked.
+        moved.speaker_fixed = pose.speaker_fixed
         self._sink.send(moved)
 
     def close(self) -> None:
