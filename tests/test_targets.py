@@ -260,3 +260,24 @@ def test_two_presets_may_go_to_one_avatar():
     check_each_once(
         (), [parse_target("vmc://127.0.0.1?preset=arkit"), parse_target("vmc://127.0.0.1?preset=unified")]
     )
+
+
+def test_a_page_that_ends_with_the_run_is_no_news_and_one_that_fails_is(model, monkeypatch, capsys):
+    class Started:
+        def __init__(self, folder, address, ended):
+            self.ended = ended
+
+        def close(self):
+            self.ended("")
+
+    started = []
+
+    def start_page(folder, address, ended):
+        started.append(Started(folder, address, ended))
+        return started[0], "http://127.0.0.1/"
+
+    monkeypatch.setattr("tonguetrack.tracker.outside.start_page", start_page)
+    assert main(["demo", "--seconds", "0.1", "--fast", "--web", "127.0.0.1:0"]) == 0
+    assert "the page has ended" not in capsys.readouterr().err
+    started[0].ended("it broke")
+    assert "the page has ended: it broke" in capsys.readouterr().err

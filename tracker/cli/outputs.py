@@ -249,8 +249,12 @@ def _show(
         else:
             window_closed()
 
+    def page_ended(complaint: str) -> None:
+        if complaint:  # without one it has ended with the run, as it should
+            say_above(f"the page has ended: {complaint}")
+
     if outputs.page:
-        page, url = start_page(folder, outputs.page, lambda why: say_above(f"the page has ended: {why}"))
+        page, url = start_page(folder, outputs.page, page_ended)
         stack.callback(page.close)
         say_above(f"page: {url}")
     if outputs.ghost:
