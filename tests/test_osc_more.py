@@ -180,6 +180,14 @@ def test_the_mesh_follows_the_speaker():
     assert np.abs(found.vertices - expected).max() < 0.002
 
 
+def test_of_a_pose_whose_weights_are_no_numbers_only_the_coils_are_sent():
+    datagrams = MoreDatagrams(context(), WORDS)
+    datagrams.begin(info())
+    list(datagrams.of(pose()))  # the ranges come with the first one
+    messages = [message for datagram in datagrams.of(pose(1, (np.nan,) * 4)) for message in decode(datagram)]
+    assert {find_address(address).path for address, _ in messages} == {"/tongue/extra", "/tongue/coil/<name>"}
+
+
 def test_without_one_of_its_chunks_the_rest_of_the_mesh_is_right():
     each = pose()
     datagrams = MoreDatagrams(context(), ["mesh"])

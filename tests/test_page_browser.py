@@ -205,6 +205,30 @@ def test_a_free_speaker_is_drawn_from_vertices(tab, feed):
 # Its controls do what they say ----------------------------------------------------------------------
 
 
+def test_a_view_whose_size_is_not_known_yet_draws_nothing_and_breaks_nothing(tab):
+    """As in a tab in the background, where a picture may come before the first layout."""
+    assert (
+        tab.run("""import(new URL("section.js", document.baseURI)).then(({ Section }) => {
+        const view = new Section(document.createElement("div"));
+        const points = [[0, 0, 0], [0, 10, 10], [0, 20, 5]];
+        view.prepare({ palate: null }, [], []);
+        view.theme(getComputedStyle(document.documentElement));
+        view.frame({ points: () => points }, [], [0], [1]);
+        view.show({ coils: [] }, points, [], []);
+        view.draw();
+        return "drawn";
+    })""")
+        == "drawn"
+    )
+
+
+def test_the_extra_delay_stands_in_one_line(tab):
+    tab.type("#delay", 2000)
+    one_line = "parseFloat(getComputedStyle(document.querySelector('#delay-shown')).fontSize) * 2"
+    assert tab.run(f"document.querySelector('#delay-shown').getBoundingClientRect().height < {one_line}")
+    tab.type("#delay", 0)
+
+
 def test_take_marker_and_speaker_reach_the_run(tab, feed, control):
     tab.type("#take-name", "aka 3")
     tab.click("#take-button")

@@ -18,6 +18,7 @@ from strict_page import decoded
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from tonguetrack.tracker.cli import main
 from tonguetrack.tracker.streams.feed import FeedNumbers
 from tonguetrack.tracker.streams.page.protocol import WINDOW
 from tonguetrack.tracker.streams.sink import LiveNumbers
@@ -198,6 +199,20 @@ def test_a_page_is_told_what_it_must_know_and_then_shown_the_pose(server, feed):
     np.testing.assert_allclose(pose["weights"], feed.pose.weights, rtol=1e-6)
     np.testing.assert_allclose(pose["coils"], feed.pose.coils, rtol=1e-5)
     assert pose["vertices"] is None and pose["fixed"] and 0 < pose["age_ms"]
+
+
+def test_a_pose_whose_weights_are_no_numbers_never_reaches_a_page(server, feed):
+    feed.show([0.5, 0.0, 0.0, 0.0])
+    with Client(server) as client:
+        client.next("pose")
+        feed.show([np.nan, 0.0, 0.0, 0.0])
+        time.sleep(0.3)
+        feed.show([1.0, 0.0, 0.0, 0.0])
+        while True:
+            pose = client.next("pose")
+            assert np.isfinite(pose["weights"]).all()
+            if np.allclose(pose["weights"], feed.pose.weights, rtol=1e-6):
+                break
 
 
 def test_the_state_tells_what_the_run_says_of_itself(server, feed):
@@ -475,6 +490,15 @@ def test_without_websockets_the_extra_is_named(feed):
         str(feed.folder), "127.0.0.1:0", before="import sys; sys.modules['websockets'] = None; "
     )
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "tonguetrack[web]" in done.stderr
+
+
+def test_without_websockets_a_run_says_so_before_it_begins(capsys, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert main(["live", "gone:", "--web", "127.0.0.1:0"]) == 2
+    assert (
+        capsys.readouterr().err
+        == "tonguetrack: the page needs the extra 'web': pip install 'tonguetrack[web]'.\n"
+    )
 
 
 def test_at_the_end_of_the_run_the_pages_are_told_and_the_server_ends(tmp_path):

@@ -50,6 +50,18 @@ def test_csv_and_npz_give_every_number_back_exactly(run, small_model, tmp_path, 
         assert getattr(again, name) == getattr(poses, name)
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+@pytest.mark.parametrize("name", ["weights", "speaker_weights"])
+def test_weights_that_are_no_numbers_are_refused_with_their_frame(run, small_model, tmp_path, suffix, name):
+    weights = getattr(run.experiment_2, name).copy()
+    weights[17, 1] = np.nan
+    write_poses(
+        dataclasses.replace(run.experiment_2, **{name: weights}), small_model, tmp_path / f"p{suffix}"
+    )
+    with pytest.raises(InputError, match="frame 17 has weights that are no numbers"):
+        read_poses(tmp_path / f"p{suffix}")
+
+
 ODD = 'a, "b"\nc\r# d: \u2028\x0c\x85 ə \udcff'
 
 

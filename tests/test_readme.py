@@ -117,6 +117,7 @@ DOCS = {
     ".venv/bin/tonguetrack render poses.csv --frame 700 -o tongue.png": HERE,
     ".venv/bin/tonguetrack render poses.csv --size 640x360 --fps 25 -o film.mp4": HERE,
     ".venv/bin/tonguetrack demo --web --seconds 60": WITHOUT_END,
+    ".venv/bin/tonguetrack demo --web --speaker=0.3,-0.1,0.2,0.1,0.2": WITHOUT_END,
     ".venv/bin/tonguetrack live simulate: --web --record takes": WITHOUT_END,
     ".venv/bin/tonguetrack live simulate: --web 0.0.0.0:8080": WITHOUT_END,
     DEMO

@@ -254,6 +254,30 @@ def test_poses_of_a_take_are_those_that_were_recorded(tmp_path):
     assert read_take(written(tmp_path / "b.xdf", parts_of(INFO, rows))).poses().experiment == 1
 
 
+def test_poses_of_a_take_know_which_coils_counted(tmp_path):
+    rows = rows_of(INFO, 6)
+    rows["pose"][2, -2:] = [CoilState.MISFIT, CoilState.WILD]
+    rows["pose"][3, -1] = 77.5  # damage
+    rows["pose"][4, 0] = np.nan  # no pose
+    rows["pose"][5, -1] = CoilState.RETURNING
+    states = read_take(written(tmp_path / "a.xdf", parts_of(INFO, rows))).poses().coil_states
+    assert states.tolist() == [
+        [0, 0],
+        [0, 0],
+        [CoilState.MISFIT, CoilState.WILD],
+        [0, 0],
+        [0, CoilState.RETURNING],
+    ]
+
+
+def test_frames_whose_weights_are_damaged_are_no_poses(tmp_path):
+    rows = rows_of(INFO, 6)
+    rows["pose"][2, 7] = np.nan
+    rows["pose"][4, 9] = np.inf
+    poses = read_take(written(tmp_path / "a.xdf", parts_of(INFO, rows))).poses()
+    np.testing.assert_array_equal(poses.weights, rows["pose"][[0, 1, 3, 5], 6:9])
+
+
 def test_markers_know_the_frame_from_which_they_hold(tmp_path):
     rows = rows_of(INFO, 30)
     at = stamps_of(rows)

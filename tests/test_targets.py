@@ -9,6 +9,7 @@ import pytest
 from tonguetrack import InputError
 from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.cli import main
+from tonguetrack.tracker.cli.outputs import check_each_once
 from tonguetrack.tracker.pose import PoseStatus, TrackedPose
 from tonguetrack.tracker.streams.monitor import decode
 from tonguetrack.tracker.streams.sink import LiveNumbers, StreamContext, StreamInfo
@@ -238,3 +239,45 @@ def test_every_kind_says_what_it_is():
     for kind in KINDS:
         assert kind.form.startswith(f"{kind.scheme}:") and kind.words
         assert all(words for words in kind.options.values())
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--to", "vmc://127.0.0.1", "--to", "vmc://127.0.0.1:39540?rate=30"],
+        ["--to", "lsl:tongue", "--to", "lsl:tongue"],
+        ["--to", "osc://127.0.0.1:9000?send=mesh", "--osc", "127.0.0.1:9000"],
+        ["--osc", "127.0.0.1:9000", "--osc", "127.0.0.1:9000"],
+    ],
+)
+def test_a_target_that_is_named_twice_is_refused(flags, capsys):
+    assert main(["demo", "--seconds", "1", *flags]) == 2
+    told = capsys.readouterr().err
+    assert "is named twice" in told and told.count("\n") == 1
+
+
+def test_two_presets_may_go_to_one_avatar():
+    check_each_once(
+        (), [parse_target("vmc://127.0.0.1?preset=arkit"), parse_target("vmc://127.0.0.1?preset=unified")]
+    )
+
+
+def test_a_page_that_ends_with_the_run_is_no_news_and_one_that_fails_is(model, monkeypatch, capsys):
+    class Started:
+        def __init__(self, folder, address, ended):
+            self.ended = ended
+
+        def close(self):
+            self.ended("")
+
+    started = []
+
+    def start_page(folder, address, ended):
+        started.append(Started(folder, address, ended))
+        return started[0], "http://127.0.0.1/"
+
+    monkeypatch.setattr("tonguetrack.tracker.outside.start_page", start_page)
+    assert main(["demo", "--seconds", "0.1", "--fast", "--web", "127.0.0.1:0"]) == 0
+    assert "the page has ended" not in capsys.readouterr().err
+    started[0].ended("it broke")
+    assert "the page has ended: it broke" in capsys.readouterr().err

@@ -98,6 +98,7 @@ def test_a_session_file_names_the_other_speaker_and_brings_that_speakers_palate(
     [
         ("1,2,3", "3 weights; the model random test model needs 5"),
         ("1,2,3,4,nan", "needs 5, all finite"),
+        ("0,0,1e300,0,0", "weight 3 is .* sigma from the mean, which is no tongue"),
         ("1,2,x,4,5", "expected a session file ending in .toml, or raw speaker weights"),
         ("", "expected a session file ending in .toml"),
         ("speaker.txt", "expected a session file ending in .toml"),

@@ -119,6 +119,14 @@ def test_a_coil_that_a_file_does_not_have_is_missing_and_the_others_count():
     assert moments[0].coil_states.tolist() == [CoilState.TRUSTED, CoilState.TRUSTED]
 
 
+def test_a_coil_that_did_not_count_in_a_take_does_not_count_when_it_is_played():
+    states = np.zeros((4, 2), np.int64)
+    states[1] = [CoilState.WILD, CoilState.MISFIT]
+    moments = moments_of(dataclasses.replace(poses(), coil_states=states))
+    assert moments[1].coil_states.tolist() == [CoilState.MISSING, CoilState.MISFIT]
+    assert moments[0].coil_states.tolist() == [CoilState.TRUSTED, CoilState.TRUSTED]
+
+
 # The cut --------------------------------------------------------------------------------------------
 
 

@@ -79,6 +79,22 @@ def test_every_preset_shows_on_a_strict_avatar(preset):
     assert performer.time_s == pytest.approx(19 / 250)
 
 
+def test_weights_that_are_no_numbers_leave_the_avatar_as_it_was_and_say_that_tracking_is_bad():
+    values = avatar_values("unified", context(), signed=False)
+    performer = Performer(values.names)
+    with receiver() as (opened, place):
+        worker = VmcWorker(place, values)
+        for each in (pose(), pose(1, sigmas=(np.nan,) * 4), pose(2, speaker_weights=np.full(5, np.inf))):
+            for datagram in sent(worker, opened, each):
+                performer.receive(datagram)
+            if each.frame_number == 0:
+                before = dict(performer.shown)
+                assert performer.tracking == 1
+            else:
+                assert performer.shown == before and performer.tracking == 0
+    assert all(np.isfinite(value) for value in before.values()) and max(before.values()) > 0
+
+
 def test_many_names_go_in_several_bundles_and_only_the_last_applies():
     names = {f"CTRL_expressions_tongue_{k}": k / 100 for k in range(100)}
     performer = Performer(names)

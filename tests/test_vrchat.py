@@ -79,6 +79,20 @@ def test_tracking_is_active_unless_nothing_is_tracked(status):
     assert avatar.states == {"LipTrackingActive": active, "ExpressionTrackingActive": active}
 
 
+def test_weights_that_are_no_numbers_leave_the_avatar_to_itself():
+    values = avatar_values("unified", context(), signed=True)
+    avatar = Avatar()
+    with receiver() as (opened, place):
+        worker = VrchatWorker(place, values, parameter_prefixes("unified"))
+        for datagram in sent(worker, opened, pose()):
+            avatar.receive(datagram)
+        before = dict(avatar.floats)
+        for datagram in sent(worker, opened, pose(1, sigmas=(np.nan, 0.0, 0.0, 0.0))):
+            avatar.receive(datagram)
+    assert avatar.floats == before and all(map(np.isfinite, before.values()))
+    assert avatar.states == {"LipTrackingActive": False, "ExpressionTrackingActive": False}
+
+
 def test_other_presets_stand_under_their_own_names():
     assert parameter_prefixes("own") == ("",)
     values = avatar_values("own", context(), signed=True)

@@ -193,6 +193,19 @@ def test_the_newest_pose_is_shown_and_g_keeps_it_as_a_ghost(tmp_path):
         assert screen.view.ghost is None
 
 
+def test_a_pose_whose_weights_are_no_numbers_is_not_shown(tmp_path):
+    with Feeder(tmp_path / "feed") as feeder, FeedReader(tmp_path / "feed") as feed:
+        screen = Screen()
+        view = LiveView(feed, scene_of_feed(feed.about), Wishes(feed), None)
+        until(feed.newest)
+        view.show(screen)
+        feeder.show([np.nan, 0, 0, 0])
+        until(lambda: np.isnan(feed.newest()[1].weights).any())
+        view.show(screen)
+        assert np.isfinite(screen.moment.weights).all()
+        assert all(np.isfinite(moment.weights).all() for moment in screen.remembered)
+
+
 def test_a_feed_that_falls_silent_is_said_to_be(tmp_path):
     feeder = Feeder(tmp_path / "feed")
     with FeedReader(tmp_path / "feed") as feed:

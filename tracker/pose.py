@@ -65,6 +65,11 @@ class TrackedPose:
     coil_states: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     coils: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
+    @property
+    def has_shape(self) -> bool:
+        """Whether there is a tongue in it: whoever draws or moves something leaves out a pose whose weights are no numbers."""
+        return bool(np.isfinite(self.weights).all() and np.isfinite(self.speaker_weights).all())
+
     def copy(self) -> TrackedPose:
         """A pose of its own, which nothing writes over."""
         return replace(
@@ -102,6 +107,7 @@ class TrackedPoses:
     model frame; vertices: the same shape, the model's points that they were fitted to, or None where a
     file does not keep them.
     roles: the coils' roles in the order of the n axis; correspondences: their vertices, in that order.
+    coil_states: (frames, n) `CoilState`, or None where they are not known: takes keep them, files of poses do not.
     experiment: 1 (speaker and pose free) or 2 (speaker fixed).
     """
 
@@ -123,10 +129,18 @@ class TrackedPoses:
     model_fingerprint: str = ""
     model_name: str = ""
     recording: str = ""
+    coil_states: NDArray[np.int64] | None = None
 
     @property
     def frame_count(self) -> int:
         return len(self.times_s)
+
+    @property
+    def have_shape(self) -> NDArray[np.bool_]:
+        """(frames,): whether all weights are numbers, so that there is a tongue."""
+        return np.asarray(
+            np.isfinite(self.weights).all(axis=1) & np.isfinite(self.speaker_weights).all(axis=1)
+        )
 
     @property
     def tracked(self) -> NDArray[np.bool_]:

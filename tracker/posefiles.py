@@ -71,16 +71,24 @@ def read_poses(path: str | Path, model: TongueModel | None = None) -> TrackedPos
     try:
         if suffix == ".csv":
             with path.open(encoding="utf-8", newline="") as file:
-                return _from_csv(file)
+                return _with_shapes(_from_csv(file))
         if suffix == ".npz":
-            return _from_npz(path.read_bytes())
-        return _from_authors_json(json.loads(path.read_text(encoding="utf-8")), model)
+            return _with_shapes(_from_npz(path.read_bytes()))
+        return _with_shapes(_from_authors_json(json.loads(path.read_text(encoding="utf-8")), model))
     except InputError as reason:
         raise InputError(f"{path}: {reason}") from reason
     except Exception as reason:  # whatever a damaged file makes the parsers stumble over
         raise InputError(
             f"{path}: this is not a readable poses file ({type(reason).__name__}: {str(reason)[:100]})."
         ) from reason
+
+
+def _with_shapes(poses: TrackedPoses) -> TrackedPoses:
+    """The poses; raises InputError where a frame's weights are no numbers, of which no tongue can be made."""
+    wrong = np.flatnonzero(~poses.have_shape)
+    if len(wrong):
+        raise InputError(f"frame {wrong[0]} has weights that are no numbers; the file is damaged.")
+    return poses
 
 
 # The authors' JSON ----------------------------------------------------------------------------------

@@ -16,7 +16,10 @@ from .. import InputError
 from ..model.multilinear import TongueModel
 from .palate import Palate
 from .pose import FloatArray, TrackedPoses
-from .session import load_session
+from .session import Session, load_session
+
+FARTHEST_SIGMA = 20.0
+"""Nobody's anatomy is as far from the mean as that; the tracker itself goes to 5."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,11 @@ def other_speaker(text: str, model: TongueModel) -> OtherSpeaker:
     return OtherSpeaker(weights, session.palate, f"the speaker of {text}")
 
 
+def session_of(speaker: OtherSpeaker) -> Session:
+    """What is known of that speaker, for whatever draws the transferred motion."""
+    return replace(Session(), speaker_weights=speaker.weights, palate=speaker.palate)
+
+
 def transferred(poses: TrackedPoses, speaker: OtherSpeaker) -> TrackedPoses:
     """The same motion in the other speaker's mouth."""
     return replace(
@@ -59,6 +67,7 @@ def transferred(poses: TrackedPoses, speaker: OtherSpeaker) -> TrackedPoses:
         residuals_mm=np.full_like(poses.residuals_mm, np.nan),
         coils=np.full_like(poses.coils, np.nan),
         vertices=None,
+        coil_states=None,
         experiment=2,
     )
 
@@ -77,5 +86,11 @@ def _checked(weights: FloatArray, model: TongueModel, where: str) -> FloatArray:
     if weights.shape != (model.speaker.size,) or not np.isfinite(weights).all():
         raise InputError(
             f"{where}: {weights.size} weights; the model {model.name} needs {model.speaker.size}, all finite."
+        )
+    sigmas = np.abs(model.speaker.normalised(weights))
+    if sigmas.max() > FARTHEST_SIGMA:
+        raise InputError(
+            f"{where}: weight {int(sigmas.argmax()) + 1} is {sigmas.max():.3g} sigma from the mean, which is no tongue any "
+            f"more; expected {FARTHEST_SIGMA:g} at most, and most people are within 3."
         )
     return weights

@@ -7,6 +7,7 @@ import json
 import sys
 from contextlib import ExitStack
 
+from .names import add_speaker_flag
 from .outputs import add_output_flags
 
 
@@ -19,6 +20,7 @@ def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]
         "poses and shows them where asked. Ctrl-C ends it with the summary and exit code 0.",
     )
     add_output_flags(demo)
+    add_speaker_flag(demo)
     demo.add_argument(
         "--seconds",
         type=positive_seconds,
@@ -53,8 +55,8 @@ def run_demo(args: argparse.Namespace) -> int:
     from .outputs import destinations, open_outputs, outputs_of
     from .watching import announced_compilation, watched
 
-    outputs = outputs_of(args)
     model = bundled_model()
+    outputs = outputs_of(args, model, args.speaker)
     recording, session = bundled_recording()
     setup = complete_setup(recording, model, session)
     speaker = "free" if setup.session.speaker_weights is None else "fixed"

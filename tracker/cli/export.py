@@ -49,6 +49,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run_export(args: argparse.Namespace) -> int:
     from ..exporting import check_export_suffix
+    from .ending import unwound
 
     target = Path(args.output)
     check_export_suffix(target)
@@ -62,7 +63,8 @@ def run_export(args: argparse.Namespace) -> int:
     keep_apart([target], [Path(args.poses), Path(args.model or poses.model_path)])
     prepare_folder(target)
     frames = range(0, poses.frame_count, args.every)
-    _write(args, target, poses, model, frames, palate)
+    with unwound():
+        _write(args, target, poses, model, frames, palate)
     what = f"{len(frames)} meshes beside {target}" if _is_mesh(target) else str(target)
     whose = f", on {other.source}" if other is not None else ""
     print(f"written: {what} ({model.name}, {len(frames)} frames{whose})", file=sys.stderr)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 LISTEN_S = 3.0
 """So long a device is listened to where the session leaves coils or vertices open."""
 FIX_AFTER_S = 5.0
+ESTIMATORS = ("mean", "joint")
 
 
 def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -56,9 +58,10 @@ def add_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]
     )
     live.add_argument("--fix-speaker-after", type=positive_seconds, metavar="N", default=FIX_AFTER_S,
                       help="with no speaker in the session: fix it after N seconds of tracked speech (default %(default)g)")  # fmt: skip
-    live.add_argument("--speaker", choices=("mean", "joint"), default="mean",
+    live.add_argument("--speaker", metavar="mean|joint|FILE|WEIGHTS", action="append", default=[],
                       help="how it is estimated: the mean of free solves as in the paper, or one for all frames, "
-                      "estimated in the background (default mean)")  # fmt: skip
+                      "estimated in the background (default mean); and, given again, on whose anatomy the tongue is shown: a "
+                      "session file (.toml) with [speaker] weights, or raw weights, --speaker=0.1,-0.2,...")  # fmt: skip
     live.add_argument("--control", metavar="HOST:PORT",
                       help="where control messages over OSC are taken (default 127.0.0.1:9001)")  # fmt: skip
     live.add_argument("--calibrate", metavar="FOLDER",
@@ -87,8 +90,9 @@ def run_live_command(args: argparse.Namespace) -> int:
     from .track import read_session
     from .watching import announced_compilation
 
-    outputs = outputs_of(args)
     model = named_model(args.model)
+    estimator, shown_speaker = speakers(args.speaker)
+    outputs = outputs_of(args, model, shown_speaker)
     session = read_session(args)
     for output in filter(None, (args.save_session, args.record)):
         keep_apart([Path(output)], [Path(args.model)])
@@ -110,13 +114,14 @@ def run_live_command(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         control = serve_controls(args.control, controls, stack)
         say(f"opening {args.source}")
-        job = Job(args, model, session, outputs, controls, control)
+        job = Job(args, model, session, outputs, controls, control, estimator)
         return follow(job, open_source(args.source))
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a person asked for, read and checked. control: where control messages are taken, "" = nowhere."""
+    """What a person asked for, read and checked. control: where control messages are taken, "" = nowhere; estimator: of
+    `ESTIMATORS`."""
 
     args: argparse.Namespace
     model: TongueModel
@@ -124,6 +129,26 @@ class Job:
     outputs: Outputs
     controls: ControlQueue
     control: str
+    estimator: str
+
+
+def speakers(texts: Sequence[str]) -> tuple[str, str | None]:
+    """The estimator of the speaker, and on whose anatomy the tongue is shown, of all that was said with --speaker."""
+    from ... import InputError
+
+    estimators = [text for text in texts if text in ESTIMATORS]
+    shown = [text for text in texts if text not in ESTIMATORS]
+    if len(estimators) > 1 or len(shown) > 1:
+        raise InputError(
+            f"--speaker {' and '.join(estimators if len(estimators) > 1 else shown)}: give one of {' and '.join(ESTIMATORS)}, "
+            "and one speaker to be shown."
+        )
+    if shown and not shown[0].lower().endswith(".toml") and not any(map(str.isdigit, shown[0])):
+        raise InputError(
+            f"--speaker {shown[0]}: expected mean or joint, how the speaker is estimated; or on whose anatomy the tongue is "
+            "shown: a session file ending in .toml, or raw speaker weights with commas between them."
+        )
+    return estimators[0] if estimators else "mean", shown[0] if shown else None
 
 
 def follow(job: Job, source: Source) -> int:
@@ -173,7 +198,7 @@ def run_source(job: Job, source: Source) -> Summary | None:
     setup = complete_setup(recording, job.model, session)
     for decision in setup.decisions:
         say(decision)
-    fix_after_s = job.args.fix_speaker_after if job.args.speaker == "mean" else None
+    fix_after_s = job.args.fix_speaker_after if job.estimator == "mean" else None
     rate_hz = source.rate_hz or recording.rate_hz
     tracker = Tracker(job.model, setup, rate_hz, watchful=True, fix_after_s=fix_after_s)
     return run_once(job, source, tracker)
@@ -255,7 +280,7 @@ def run_once(job: Job, source: Source, tracker: Tracker) -> Summary:
             said=say_above,
             handles=obey_client if isinstance(source, AuthorsLive) else None,
         )
-        if args.speaker == "joint" and tracker.setup.session.speaker_weights is None:
+        if job.estimator == "joint" and tracker.setup.session.speaker_weights is None:
             estimate_beside(run, stack)
         say(f"tracking {', '.join(tracker.setup.roles)} to {destinations(sinks)}")
         with status_line(status):

@@ -6,7 +6,7 @@ import argparse
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,11 +14,13 @@ from .names import BUNDLED
 from .showing import add_ghost_flag
 
 if TYPE_CHECKING:
+    from ...model.multilinear import TongueModel
     from ..online import Tracker
     from ..status import LiveStatus
     from ..streams.feed import FeedNumbers, FeedSink
     from ..streams.sink import LiveNumbers, Sink
     from ..streams.targets import Target
+    from ..transfer import OtherSpeaker
 
 DEFAULT_OSC = "127.0.0.1:9000"
 DEFAULT_PAGE = "127.0.0.1:8080"
@@ -39,21 +41,27 @@ def add_output_flags(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a user asked for, checked. page: HOST:PORT, "" = none; ghost: FILE[@SECONDS] for the window, "" = none."""
+    """What a user asked for, checked. page: HOST:PORT, "" = none; ghost: FILE[@SECONDS] for the window, "" = none;
+    other: the speaker on whose anatomy meshes are made, None = on that of the one who is tracked."""
 
     osc: tuple[str, ...]
     targets: tuple[Target, ...]
     view: bool
     page: str
     ghost: str = ""
+    other: OtherSpeaker | None = None
 
     @property
     def shown(self) -> bool:
         return self.view or bool(self.page)
 
 
-def outputs_of(args: argparse.Namespace) -> Outputs:
-    """Raises InputError where a destination is none, its host is unknown, or the page's port is taken."""
+def outputs_of(args: argparse.Namespace, model: TongueModel, speaker: str | None) -> Outputs:
+    """speaker: what --speaker says of the anatomy that is shown, None = nothing.
+
+    Raises InputError where a destination is none, its host is unknown, the page's port is taken, or the speaker is none
+    of the model's.
+    """
     from ... import InputError
     from ..streams.osc import resolve
     from ..streams.targets import parse_target
@@ -62,20 +70,55 @@ def outputs_of(args: argparse.Namespace) -> Outputs:
     osc = tuple(args.osc or ([] if targets else [DEFAULT_OSC]))
     for destination in osc:
         resolve(destination)
+    check_each_once(osc, targets)
     if args.web:
         check_page(args.web)
     if args.ghost and not args.view:
         raise InputError("--ghost is shown in the window: add --view.")
-    return Outputs(osc, targets, args.view, args.web or "", args.ghost or "")
+    outputs = Outputs(osc, targets, args.view, args.web or "", args.ghost or "")
+    if speaker is None:
+        return outputs
+    from ..transfer import other_speaker
+
+    other = other_speaker(speaker, model)
+    if not outputs.shown and not any(makes_a_mesh(target) for target in targets):
+        raise InputError(
+            "--speaker says on whose anatomy the tongue is shown; add what shows it: --view, --web, or --to with "
+            "osc://HOST:PORT?send=mesh or oscquery://HOST."
+        )
+    return replace(outputs, other=other)
+
+
+def check_each_once(osc: Sequence[str], targets: Sequence[Target]) -> None:
+    """Raises InputError where one place would get the same twice: a receiver would take it for one confused stream."""
+    from ... import InputError
+    from ..streams.osc import parse_destination
+
+    named = [("osc", *parse_destination(text), "", "") for text in osc]
+    named += [(each.kind.scheme, each.host, each.port, each.name, each.preset) for each in targets]
+    for place in named:
+        if named.count(place) > 1:
+            scheme, host, port, name, _ = place
+            raise InputError(
+                f"{scheme} to {name or f'{host}:{port}'} is named twice; name each target once, with all its options."
+            )
+
+
+def makes_a_mesh(target: Target) -> bool:
+    return target.kind.scheme == "oscquery" or "mesh" in target.send
 
 
 def check_page(address: str) -> None:
-    """Raises InputError where a server could not listen there: better now than after minutes of calibration."""
+    """Raises InputError where a server could not listen there, or the extra is missing: better now than after minutes of
+    calibration."""
     import socket
+    from importlib.util import find_spec
 
     from ... import InputError
     from ..streams.osc import resolve
 
+    if find_spec("websockets") is None:
+        raise InputError("the page needs the extra 'web': pip install 'tonguetrack[web]'.")
     family, place = resolve(address, lowest_port=0)
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         try:
@@ -134,6 +177,7 @@ def open_outputs(
     from ..streams.osc import OscSink
     from ..streams.sink import StreamContext
     from ..streams.targets import open_target
+    from ..streams.transferred import TransferredSink
     from .watching import say_above
 
     opened = OpenOutputs()
@@ -146,6 +190,9 @@ def open_outputs(
         session = tracker.setup.session
         palate = None if session.palate is None else session.palate.points_mm
         context = StreamContext(tracker.model, palate, session.shape_ranges, control=control)
+        if (other := outputs.other) is not None:
+            shown_palate = None if other.palate is None else other.palate.points_mm
+            context = replace(context, shown_speaker=other.weights, shown_palate=shown_palate)
         for target in outputs.targets:
             for sink in open_target(target, context, opened.numbers, say_above):
                 stack.callback(sink.close)
@@ -153,7 +200,7 @@ def open_outputs(
     if outputs.shown:
         feed = _show(outputs, tracker, stack, model_name, control, title, window_closed)
         feed.numbers = opened.feed_numbers
-        opened.sinks.append(feed)
+        opened.sinks.append(feed if outputs.other is None else TransferredSink(feed, outputs.other.weights))
     return opened
 
 
@@ -172,15 +219,19 @@ def _show(
     from ..session import session_toml
     from ..streams.feed import FeedAbout, FeedSink
     from ..streams.feedfolder import feed_folder
+    from ..transfer import session_of, transferred
     from .showing import read_ghost
     from .watching import say_above
 
-    model, setup = tracker.model, tracker.setup
+    model, setup, other = tracker.model, tracker.setup, outputs.other
+    session, roles, vertices = setup.session, setup.roles, setup.vertices
+    if other is not None:  # with that speaker's palate, and without coils, which are in another mouth
+        session, roles, vertices = session_of(other), (), ()
     about = FeedAbout(
         model=model_name if model_name == BUNDLED else str(Path(model_name).resolve()),
-        session=session_toml(setup.session),
-        roles=setup.roles,
-        correspondences=setup.vertices,
+        session=session_toml(session),
+        roles=roles,
+        correspondences=vertices,
         coefficients=model.pose.size,
         speaker_weights=model.speaker.size,
         control=control,
@@ -198,12 +249,17 @@ def _show(
         else:
             window_closed()
 
+    def page_ended(complaint: str) -> None:
+        if complaint:  # without one it has ended with the run, as it should
+            say_above(f"the page has ended: {complaint}")
+
     if outputs.page:
-        page, url = start_page(folder, outputs.page, lambda why: say_above(f"the page has ended: {why}"))
+        page, url = start_page(folder, outputs.page, page_ended)
         stack.callback(page.close)
         say_above(f"page: {url}")
     if outputs.ghost:
-        write_poses(read_ghost(outputs.ghost, model), model, folder / GHOST_NAME)
+        ghost = read_ghost(outputs.ghost, model)
+        write_poses(ghost if other is None else transferred(ghost, other), model, folder / GHOST_NAME)
     if outputs.view:
         stack.callback(start_window(folder, window_ended).close)
     stack.callback(feed.close)  # before the processes are waited for, which go by it

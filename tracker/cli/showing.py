@@ -56,7 +56,8 @@ class Shown:
 
 def shown(args: argparse.Namespace) -> Shown:
     """Reads it all. Raises InputError where something is missing, foreign or damaged."""
-    from ..session import Session, load_session
+    from ..session import load_session
+    from ..transfer import session_of
     from ..viewer.look import DARK, LIGHT
     from ..viewer.playback import Ghost, check_times
     from ..viewer.scene import moments_of
@@ -66,9 +67,9 @@ def shown(args: argparse.Namespace) -> Shown:
         session = load_session(args.session)
     poses, other = replayed(poses, model, args.speaker)
     if other is not None:
-        session = replace(Session(), palate=other.palate)
+        session = session_of(other)
     check_times(poses.times_s, args.file)
-    poses = _with_coils(poses, session)
+    poses = with_coils(poses, session)
     scene = scene_to_show(poses, model, session, Path(args.file).stem)
     if args.colour == "palate" and scene.palate is None:
         raise InputError("--colour palate: no palate is known; name a session that has one with --session.")
@@ -90,7 +91,7 @@ def poses_to_show(path: str, model_name: str | None) -> tuple[TrackedPoses, Tong
     return poses, model, parse_session(session, path)
 
 
-def _with_coils(poses: TrackedPoses, session: Session) -> TrackedPoses:
+def with_coils(poses: TrackedPoses, session: Session) -> TrackedPoses:
     """Without coils where none was measured, or where nothing says to which vertices they belong."""
     import numpy as np
 
@@ -110,6 +111,7 @@ def _with_coils(poses: TrackedPoses, session: Session) -> TrackedPoses:
         correspondences=(),
         coils=np.zeros((frames, 0, 3)),
         residuals_mm=np.zeros((frames, 0)),
+        coil_states=None,
     )
 
 

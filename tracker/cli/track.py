@@ -58,6 +58,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     track.add_argument("--osc", metavar="HOST:PORT", help="also stream the poses over OSC")
     track.add_argument("--view", action="store_true", help="show the poses in a window (extra 'viewer')")
+    add_speaker_flag(track)
     track.add_argument("--realtime", action="store_true", help="stream at the recording's own pace")
     track.add_argument("--json", action="store_true", help="the summary as JSON on stdout")
     add_recording_flags(track)
@@ -104,6 +105,15 @@ def run_track(args: argparse.Namespace) -> int:
 
         resolve(args.osc)
     model = named_model(args.model)
+    if args.speaker is not None:
+        from ..transfer import other_speaker
+
+        if not args.view:
+            raise InputError(
+                "--speaker says on whose anatomy the window shows the tongue; add --view. For poses that were written, "
+                "'view', 'render', 'export' and 'mesh' have it."
+            )
+        other_speaker(args.speaker, model)
     session = read_session(args)
     print(f"model: {model.name} [{model.fingerprint}]", file=sys.stderr)
     for path, reason in left_out:
@@ -183,22 +193,27 @@ def _track_one(
         print(stream, file=sys.stderr)
         report["stream"] = stream.as_dict()
     if args.view:
-        _show(run, model, job.path.stem)
+        _show(run, model, job.path.stem, args.speaker)
     if not job.outputs and not args.osc and not args.view:
         print("  nothing was written; add --out poses.csv, --osc HOST:PORT or --view", file=sys.stderr)
     return report
 
 
-def _show(run: TrackingRun, model: TongueModel, name: str) -> None:
+def _show(run: TrackingRun, model: TongueModel, name: str, speaker: str | None) -> None:
     """The poses in a window. One that cannot be opened is a sentence: the tracking is done."""
+    from ..transfer import session_of
     from ..viewer.player import play
     from ..viewer.scene import moments_of
-    from .showing import scene_to_show
+    from .showing import scene_to_show, with_coils
 
-    poses = run.experiment_2 or run.experiment_1
+    poses, session = run.experiment_2 or run.experiment_1, run.setup.session
     assert poses is not None
+    poses, other = replayed(poses, model, speaker)
+    if other is not None:
+        session = session_of(other)
+        poses = with_coils(poses, session)
     try:
-        play(scene_to_show(poses, model, run.setup.session, name), moments_of(poses))
+        play(scene_to_show(poses, model, session, name), moments_of(poses))
     except InputError as reason:
         print(f"  no window: {reason}", file=sys.stderr)
 

@@ -62,6 +62,13 @@ def run_view(args: argparse.Namespace) -> int:
 
 
 def run_render(args: argparse.Namespace) -> int:
+    from .ending import unwound
+
+    with unwound():
+        return _render(args)
+
+
+def _render(args: argparse.Namespace) -> int:
     from ..viewer.film import (
         Shot,
         can_film,

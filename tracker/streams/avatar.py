@@ -24,6 +24,7 @@ class AvatarValues:
         self._mixer = mixer
         self._kept = np.flatnonzero(signed | (mixer.low >= 0.0))
         self.names = tuple(mixer.names[k] for k in self._kept)
+        self._last = np.zeros(len(self.names))
         self.preset = preset.name
         if not self.names:
             raise InputError(
@@ -31,8 +32,10 @@ class AvatarValues:
             )
 
     def values(self, pose: TrackedPose) -> FloatArray:
-        """(targets,) of a pose, within 0..1 or -1..1."""
-        return self._mixer(self._meter.measure(pose.speaker_weights, pose.weights))[self._kept]
+        """(targets,) of a pose, within 0..1 or -1..1; as they were last where the pose has no shape: an avatar would break."""
+        if pose.has_shape:
+            self._last = self._mixer(self._meter.measure(pose.speaker_weights, pose.weights))[self._kept]
+        return self._last
 
 
 def avatar_values(preset: str, context: StreamContext, signed: bool) -> AvatarValues:

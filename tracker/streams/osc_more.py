@@ -14,7 +14,7 @@ from math import isfinite
 import numpy as np
 
 from ... import InputError
-from ...model.multilinear import SpeakerModel, TongueModel
+from ...model.multilinear import SpeakerModel
 from ..pose import FloatArray, TrackedPose
 from .addresses import (
     COIL,
@@ -63,7 +63,7 @@ class MoreDatagrams:
             _Shapes(context, "shapes" in send, "unit" in send) if {"shapes", "unit"} & {*send} else None
         )
         self._contact = _Contact(context) if "contact" in send else None
-        self._mesh = _Mesh(context.model) if "mesh" in send else None
+        self._mesh = _Mesh(context) if "mesh" in send else None
         self._sequence = 0
         self._start_s: float | None = None
         self._next_ranges_s = 0.0
@@ -81,7 +81,7 @@ class MoreDatagrams:
             sequence, pose.frame_number & SEQUENCE_MASK, pose.device_time_s - self._start_s
         )
         yield from bundles_of(self._elements(pose), first)
-        if self._mesh is not None:
+        if self._mesh is not None and pose.has_shape:
             yield from self._mesh.datagrams(pose, sequence)
 
     def _elements(self, pose: TrackedPose) -> Iterator[bytes]:
@@ -89,12 +89,13 @@ class MoreDatagrams:
             if all(map(isfinite, place)):
                 yield message.element(*place)
         if self._shapes is not None:
-            yield from self._shapes.elements(pose)
+            if pose.has_shape:
+                yield from self._shapes.elements(pose)
             now_s = time.perf_counter()
             if now_s >= self._next_ranges_s:
                 self._next_ranges_s = now_s + INFO_PERIOD_S
                 yield from self._shapes.ranges()
-        if self._contact is not None:
+        if self._contact is not None and pose.has_shape:
             yield from self._contact.elements(pose)
 
 
@@ -167,15 +168,17 @@ class _Contact:
 
 
 class _Mesh:
-    """The datagrams of `send=mesh`, for one model."""
+    """The datagrams of `send=mesh`, on the anatomy that the context shows."""
 
-    def __init__(self, model: TongueModel) -> None:
-        self._model = model
+    def __init__(self, context: StreamContext) -> None:
+        self._model = context.model
+        self._shown = context.shown_speaker
         self._speaker: SpeakerModel | None = None
 
     def datagrams(self, pose: TrackedPose, sequence: int) -> Iterator[bytes]:
-        if self._speaker is None or not np.array_equal(self._speaker.speaker_weights, pose.speaker_weights):
-            self._speaker = self._model.for_speaker(pose.speaker_weights)
+        weights = pose.speaker_weights if self._shown is None else self._shown
+        if self._speaker is None or not np.array_equal(self._speaker.speaker_weights, weights):
+            self._speaker = self._model.for_speaker(weights)
         yield from mesh_datagrams(self._speaker.vertices(pose.weights), sequence)
 
 

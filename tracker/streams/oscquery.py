@@ -290,20 +290,24 @@ class OscQueryWorker:
         return about
 
     def _model(self) -> bytes:
-        """The model of the present speaker as GLB."""
+        """The model of the speaker who is shown as GLB."""
         from ..gltf import glb
 
         with self._asking:
             assert self._info is not None, "begin() comes before any answer"
             info, newest = self._info, self._newest
-            weights = info.speaker_weights if newest is None else newest[1].speaker_weights
+            weights, palate = info.speaker_weights, self._context.palate
+            if self._context.shown_speaker is not None:
+                weights, palate = self._context.shown_speaker, self._context.shown_palate
+            elif newest is not None and newest[1].has_shape:
+                weights = newest[1].speaker_weights
             now_s = time.monotonic()
             if self._glb is None or (
                 now_s - self._glb[0] > GLB_PERIOD_S and not np.array_equal(weights, self._glb[1])
             ):
                 model = self._context.model
                 rebased = rebased_pose(model.pose, self._context.ranges)
-                made = glb(model.for_speaker(weights), rebased, model.name, palate=self._context.palate)
+                made = glb(model.for_speaker(weights), rebased, model.name, palate=palate)
                 self._glb = now_s, weights.copy(), made
             return self._glb[2]
 

@@ -37,7 +37,8 @@ class StreamContext:
 
     palate: (p, 3) mm in the model frame, from front to back, or None; ranges: of the speaker's avatar shapes, name ->
     lowest and highest value, empty where they were never measured; name: of the stream, for people and receivers;
-    control: HOST:PORT where the run takes control messages over OSC, "" = nowhere.
+    control: HOST:PORT where the run takes control messages over OSC, "" = nowhere; shown_speaker: (m,) raw weights of
+    the speaker on whose anatomy meshes are made, None = of the one who is tracked; shown_palate: (p, 3) mm, of that speaker.
     """
 
     model: TongueModel
@@ -45,6 +46,8 @@ class StreamContext:
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     name: str = "tonguetrack"
     control: str = ""
+    shown_speaker: FloatArray | None = None
+    shown_palate: FloatArray | None = None
 
 
 Pair = tuple[float | None, float | None]

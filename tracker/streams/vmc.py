@@ -77,7 +77,7 @@ class VmcWorker:
     def work(self, pose: TrackedPose) -> None:
         if self._start_s is None:
             self._start_s = pose.device_time_s
-        status = TRACKING_OK if pose.status == PoseStatus.OK else TRACKING_BAD
+        status = TRACKING_OK if pose.status == PoseStatus.OK and pose.has_shape else TRACKING_BAD
         values = iter(self._values.values(pose).tolist())
         for bundle in self._bundles:
             bundle.set(0, LOADED, CALIBRATED, NORMAL_MODE, status)

@@ -84,7 +84,7 @@ class VrchatWorker:
 
     def work(self, pose: TrackedPose) -> None:
         values = iter(self._values.values(pose).tolist() * self._copies)
-        for bundle in self._bundles[pose.status != PoseStatus.LOST]:
+        for bundle in self._bundles[pose.status != PoseStatus.LOST and pose.has_shape]:
             for message, count in enumerate(bundle.numbers):
                 if count:
                     bundle.set(message, next(values))

@@ -16,7 +16,7 @@ from ...drivers.files.recognise import read_head
 from ...drivers.files.xdf import TakeHead, is_xdf, take_recording, take_times
 from ...drivers.frames import CoilFrame, Recording
 from ...drivers.xdf import XdfFile, XdfStream, map_file, read_xdf
-from ..pose import FloatArray, PoseStatus, TrackedPoses
+from ..pose import CoilState, FloatArray, PoseStatus, TrackedPoses
 from ..setup import MODEL_FRAME
 from .headers import info_from_streams
 from .journal import Rows, journal_path, read_journal, read_journal_marks
@@ -243,14 +243,16 @@ class Take:
         )
 
     def poses(self) -> TrackedPoses:
-        """What the tracker made of the frames, without those whose poses are lost.
+        """What the tracker made of the frames, without those whose poses are lost or damaged beyond use.
 
         Raises InputError where there are none.
         """
         self._check_frames()
         info, pose = self.info, self.pose
         status = pose[:, POSE_HEAD.index("status")]
-        there = np.isin(status, [int(known) for known in PoseStatus])
+        first, last = len(POSE_HEAD), len(POSE_HEAD) + len(info.pose_mean) + info.speaker_size
+        shaped = np.isfinite(pose[:, first:last]).all(axis=1)
+        there = np.isin(status, [int(known) for known in PoseStatus]) & shaped
         if not there.any():
             raise InputError(f"{self.path}: the take has no poses.")
         times, rate_hz, _ = take_times(self.stamps, self.device_times, info.rate_hz, str(self.path))
@@ -277,6 +279,7 @@ class Take:
             model_fingerprint=info.model_fingerprint,
             model_name=info.model_name,
             recording=str(self.path),
+            coil_states=_states(self.coil_states()[there]),
         )
 
     def coil_states(self) -> FloatArray:
@@ -371,6 +374,12 @@ def read_take(path: str | os.PathLike[str]) -> Take:
 
 def stream_count(stream: XdfStream | None) -> int:
     return 0 if stream is None else stream.count
+
+
+def _states(numbers: FloatArray) -> NDArray[np.int64]:
+    """The `CoilState` that the numbers stand for; damage makes any number of one, which then is trusted."""
+    known = np.isin(numbers, [int(state) for state in CoilState])
+    return np.where(known, numbers, CoilState.TRUSTED).astype(np.int64)
 
 
 def _possible(stamps: FloatArray) -> NDArray[np.bool_]:

@@ -121,7 +121,10 @@ class LiveView:
         """One picture of the newest pose; the poses since the last picture are in the coils' trails."""
         now_s = time.monotonic()
         for sequence, pose in self._feed.since(self._seen):
-            self._seen, self._since_s, self._moment = sequence, now_s, moment_of(pose)
+            self._seen = sequence
+            if not pose.has_shape:
+                continue
+            self._since_s, self._moment = now_s, moment_of(pose)
             window.remember(self._moment)
         view = window.view
         view.ghost = self._frozen if self._ghost is None else self._ghost.at(now_s - self._begin_s)

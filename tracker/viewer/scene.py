@@ -183,13 +183,14 @@ class Moments(Sequence[Moment]):
             return [self[i] for i in range(*index.indices(len(self)))]
         poses = self._poses
         missing = np.isnan(poses.coils[index]).any(axis=-1)
+        known = CoilState.TRUSTED if poses.coil_states is None else poses.coil_states[index]
         return Moment(
             poses.weights[index],
             poses.normalised[index],
             poses.speaker_weights[index],
             poses.coils[index],
             poses.residuals_mm[index],
-            np.where(missing, CoilState.MISSING, CoilState.TRUSTED),
+            np.where(missing, CoilState.MISSING, known),
             int(poses.statuses[index]),
             float(poses.residual_mm[index]),
             float(poses.times_s[index]),
@@ -197,7 +198,7 @@ class Moments(Sequence[Moment]):
 
 
 def moments_of(poses: TrackedPoses) -> Moments:
-    """The moments of a file's poses; which coils were trusted is not kept there: those present count as trusted."""
+    """The moments of a file's poses; where it does not keep which coils were trusted, those present count as trusted."""
     return Moments(poses)
 
 

@@ -12,6 +12,7 @@ export class Section {
     new ResizeObserver(() => this.resize()).observe(place);
     this.stale = true;
     this.window = null;
+    this.ratio = 0; // until its size is known: a tab in the background draws before that
   }
 
   prepare(hello, names, colours) {
@@ -77,7 +78,7 @@ export class Section {
   }
 
   draw() {
-    if (!this.stale || !this.look || !this.window || !this.canvas.width) return;
+    if (!this.stale || !this.look || !this.window || !this.ratio || !this.canvas.width) return;
     this.stale = false;
     const pen = this.context, { low, high } = this.window;
     const width = this.canvas.width / this.ratio, height = this.canvas.height / this.ratio;

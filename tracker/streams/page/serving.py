@@ -353,6 +353,8 @@ class PageServer:
             if newest is None or newest[0] == self._sequence:
                 continue
             self._sequence, pose = newest
+            if not pose.has_shape:
+                continue
             self._number += 1
             message = pose_message(
                 pose, self._number, self._sequence, self._anatomy.number, time.perf_counter_ns(), self._vertices(pose)
