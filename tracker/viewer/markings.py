@@ -208,7 +208,7 @@ class Markings:
         if len(rows) > room:
             rows = [*rows[: room - 1], (f"... {len(rows) - room + 1} more lines", look.faint_text)]
         for number, (row, colour) in enumerate(rows):
-            self._marks.text(margin, margin + number * typeface.line_px, row, colour)
+            self._backed(margin, margin + number * typeface.line_px, row, colour)
 
     def _legend(self, legend: Legend) -> None:
         look, typeface, marks, area = self._look, self._typeface, self._marks, self._layout.solid
