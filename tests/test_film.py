@@ -19,15 +19,16 @@ from PIL import Image
 from tonguetrack import InputError
 from tonguetrack.tracker.bundled import bundled_model, bundled_recording
 from tonguetrack.tracker.cli import main
-from tonguetrack.tracker.cli.showing import read_ghost
+from tonguetrack.tracker.cli.showing import read_ghost, scene_to_show
 from tonguetrack.tracker.palate import curve_palate
 from tonguetrack.tracker.pose import TrackedPoses
 from tonguetrack.tracker.posefiles import read_poses, write_poses
 from tonguetrack.tracker.session import Session, session_toml
 from tonguetrack.tracker.viewer import film
+from tonguetrack.tracker.viewer.camera import flat_projection, layout_of
 from tonguetrack.tracker.viewer.film import Shot
 from tonguetrack.tracker.viewer.look import DARK, LIGHT
-from tonguetrack.tracker.viewer.scene import moments_of, scene_of
+from tonguetrack.tracker.viewer.scene import moments_of
 
 SMALL = ["--size", "320x240"]
 FRAMES, RATE_HZ = 21, 20.0
@@ -137,8 +138,19 @@ def test_the_films_pictures_are_those_of_the_interpolated_poses(drawn):
 
 
 def scene_of_poses(poses):
-    model = bundled_model()
-    return scene_of(model, Session(), poses.roles, poses.correspondences, f"poses, {model.name}")
+    return scene_to_show(poses, bundled_model(), Session(), "poses")
+
+
+def test_the_tongue_of_the_poses_is_inside_the_picture_even_where_no_session_says_whose_it_is(drawn):
+    poses, model = read_poses("poses.csv"), bundled_model()
+    for another in (poses.speaker_weights, 3.0 * poses.speaker_weights):
+        moved = replace(poses, speaker_weights=another)
+        scene = scene_of_poses(moved)
+        area = layout_of((640, 360), DARK).flat
+        flat = flat_projection(scene, area, 10)
+        for frame in range(0, moved.frame_count, 5):
+            vertices = model.vertices(another[frame], moved.weights[frame])
+            assert all(area.holds(x, y) for x, y in flat.pixels(vertices)[:, :2])
 
 
 @pytest.mark.parametrize(

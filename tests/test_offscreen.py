@@ -420,7 +420,7 @@ def letters(drawing, moment, view):
     return np.concatenate(rows)
 
 
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("size", [*SIZES, (400, 900)])
 def test_no_letter_is_cut_by_the_pictures_edge_or_runs_into_another_area(model, scene, size):
     require_egl()
     long = dataclasses.replace(
@@ -448,6 +448,27 @@ def test_no_letter_is_cut_by_the_pictures_edge_or_runs_into_another_area(model, 
     assert top.min() >= 0 and (top + 1.25 * font).max() <= size[1]
     edge = layout.flat.x
     assert not ((left < edge - 1) & (right > edge + 1)).any()
+
+
+@pytest.mark.parametrize("look", [DARK, LIGHT])
+def test_words_on_the_tongue_have_the_ground_behind_them(model, scene, look):
+    require_egl()
+    view, moment = home_view(scene), posed(model, POSES[0])
+    many = dataclasses.replace(view, lines=("a line as wide as it is here, more or less",) * 30)
+    with Offscreen(scene, SIZE, look) as drawing:
+        plain, covered = (drawing.picture(moment, one) for one in (view, many))
+        rows = letters(drawing, moment, many)
+    middle = (np.abs(rows[:, 0] - 0.27 * SIZE[0]) < 60) & (np.abs(rows[:, 1] - 0.5 * SIZE[1]) < 60)
+    left, top = rows[middle, :2].min(axis=0).astype(int)
+    right, bottom = rows[middle, :2].max(axis=0).astype(int)
+    ground = np.round(255 * np.array(look.background))
+    far, near = (
+        np.median(np.abs(picture[top:bottom, left:right] - ground).max(axis=-1))
+        for picture in (plain, covered)
+    )
+    assert (
+        far > 100 and near < 0.5 * far
+    )  # the tongue is there, and what is between the letters is nearly the ground
 
 
 def test_more_lines_than_there_is_room_for_are_counted(drawing, model, scene):

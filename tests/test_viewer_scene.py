@@ -75,6 +75,15 @@ def test_a_scene_is_as_large_as_its_own_speakers_tongue(model, scene):
         dataclasses.replace(scene, speaker_weights=np.ones(2))
 
 
+def test_a_scene_of_nobody_in_particular_has_room_for_other_tongues_than_the_mean_ones(model, scene):
+    low, high = dataclasses.replace(scene, speaker_weights=None).extent
+    for direction, sigma in enumerate(model.speaker.sigma):
+        speaker = model.speaker.mean.copy()
+        speaker[direction] += sigma
+        vertices = model.vertices(speaker, model.pose.raw([0, -2.0, 0, 0]))
+        assert (vertices >= low - 1e-9).all() and (vertices <= high + 1e-9).all()
+
+
 def test_a_moment_is_a_copy_that_the_next_frame_does_not_write_over():
     pose = TrackedPose(
         np.ones(4), np.full(4, 2.0), np.full(5, 3.0), np.full(2, 0.5), 0.5, 1.0, 2, PoseStatus.HELD, 7.25,

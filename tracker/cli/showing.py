@@ -116,8 +116,11 @@ def with_coils(poses: TrackedPoses, session: Session) -> TrackedPoses:
 
 
 def scene_to_show(poses: TrackedPoses, model: TongueModel, session: Session, name: str) -> Scene:
+    import numpy as np
+
     from ..viewer.scene import scene_of
 
+    session = replace(session, speaker_weights=np.median(poses.speaker_weights, axis=0))
     # The model's name says where it is synthetic.
     return scene_of(model, session, poses.roles, poses.correspondences, f"{name}, {model.name}")
 

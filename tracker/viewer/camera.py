@@ -20,6 +20,8 @@ FIELD_DEG = 28.0
 """The angle that the camera sees along the shorter side of its panel."""
 NEAREST_MM, FARTHEST_MM = 20.0, 2000.0
 STEEPEST_DEG = 89.0
+NARROW = 0.75
+"""In a picture higher than this share of its width, words are no larger than in one that is as high as that."""
 
 
 @dataclass
@@ -86,7 +88,8 @@ class Layout:
 def layout_of(size: tuple[int, int], look: Look) -> Layout:
     """The places in a picture of this size (width, height)."""
     width, height = size
-    font = int(np.clip(round(height * look.font_share), look.smallest_font_px, look.largest_font_px))
+    font_px = round(min(height, NARROW * width) * look.font_share)
+    font = int(np.clip(font_px, look.smallest_font_px, look.largest_font_px))
     margin = max(6, round(0.6 * font))
     column = round(0.46 * width)
     bars_height = max(round(0.24 * height), 7 * font)

@@ -180,12 +180,12 @@ class Markings:
                 if left < other_right and other_left < left + width and top < bottom:
                     top = bottom
             taken.append((left, left + width, top + typeface.line_px))
-            self._backed(left, top, name, self._look.warning if state else self._look.text)
+            self._backed(left, top, name, self._look.warning if state else self._look.text, self._look.panel)
 
-    def _backed(self, x: float, y: float, text: str, colour: Colour) -> None:
+    def _backed(self, x: float, y: float, text: str, colour: Colour, ground: Colour) -> None:
         """Text on a ground of its own, readable on the tongue as well."""
         width, height = self._typeface.width(text), self._typeface.line_px
-        self._marks.bar(x - 3, y - 1, x + width + 3, y + height - 1, self._look.panel, 0.62)
+        self._marks.bar(x - 3, y - 1, x + width + 3, y + height - 1, ground, 0.62)
         self._marks.text(x, y, text, colour)
 
     def _status(self, moment: Moment, view: View) -> None:
@@ -208,7 +208,7 @@ class Markings:
         if len(rows) > room:
             rows = [*rows[: room - 1], (f"... {len(rows) - room + 1} more lines", look.faint_text)]
         for number, (row, colour) in enumerate(rows):
-            self._backed(margin, margin + number * typeface.line_px, row, colour)
+            self._backed(margin, margin + number * typeface.line_px, row, colour, look.background)
 
     def _legend(self, legend: Legend) -> None:
         look, typeface, marks, area = self._look, self._typeface, self._marks, self._layout.solid

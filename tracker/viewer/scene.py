@@ -66,7 +66,7 @@ class Scene:
     contour: (c,) vertices of the upper surface in the mid-sagittal plane, tip to root.
     roles, correspondences: the tracked coils, and the vertex that each is held to.
     palate: (p, 3) mm, front to back, or None; title: what this is, for people; speaker_weights: (m,) of the speaker
-    who is to fit into the picture, None = the mean.
+    who is to fit into the picture, None = not known.
     """
 
     model: TongueModel
@@ -102,17 +102,24 @@ class Scene:
 
     @cached_property
     def extent(self) -> FloatArray:
-        """(2, 3) mm, lowest and highest corner: where the speaker's tongue can be, and the palate."""
-        weights = self.model.speaker.mean if self.speaker_weights is None else self.speaker_weights
-        speaker = self.model.for_speaker(weights)
-        shapes = [speaker.vertices(speaker.mean)]
-        for direction, sigma in enumerate(speaker.sigma):
-            for side in (-2.0, 2.0):
-                weights = speaker.mean.copy()
-                weights[direction] += side * sigma
-                shapes.append(speaker.vertices(weights))
+        """(2, 3) mm, lowest and highest corner: where the speaker's tongue can be, and the palate.
+
+        Two sigma of each pose direction; where the speaker is not known, also one of each speaker direction.
+        """
+        stated, some = self.speaker_weights, self.model.speaker
+        speakers = [stated] if stated is not None else [some.mean, *_aside(some.mean, some.sigma)]
+        shapes = []
+        for speaker in map(self.model.for_speaker, speakers):
+            poses = [speaker.mean, *_aside(speaker.mean, 2.0 * speaker.sigma)]
+            shapes += [speaker.vertices(weights) for weights in poses]
         points = np.concatenate(shapes if self.palate is None else [*shapes, self.palate])
         return np.array([points.min(axis=0), points.max(axis=0)])
+
+
+def _aside(mean: FloatArray, reach: FloatArray) -> list[FloatArray]:
+    """The mean (K,), with each coefficient in turn less and more by its reach (K,)."""
+    steps = np.diag(reach)
+    return [mean + step for step in (*-steps, *steps)]
 
 
 @dataclass
