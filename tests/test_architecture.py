@@ -99,7 +99,11 @@ CORE = tuple(
     for name in SOURCES
     if within(name, "tonguetrack.tracker")
     and not within(
-        name, "tonguetrack.tracker.cli", "tonguetrack.tracker.streams", "tonguetrack.tracker.viewer"
+        name,
+        "tonguetrack.tracker.cli",
+        "tonguetrack.tracker.streams",
+        "tonguetrack.tracker.viewer",
+        "tonguetrack.tracker.preferenceserver",
     )
 )
 
