@@ -93,7 +93,7 @@ def offences(rows: list[str]) -> None:
 
 # Who may import whom --------------------------------------------------------------------------------
 
-ROOT_MODULES = ("tonguetrack", "tonguetrack.atomic", "tonguetrack.archive")
+ROOT_MODULES = ("tonguetrack", "tonguetrack.atomic", "tonguetrack.archive", "tonguetrack.parallel")
 CORE = tuple(
     name
     for name in SOURCES
