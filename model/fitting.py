@@ -24,13 +24,14 @@ one is taken that is nearest to the training speakers and poses, in units of the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import InputError
+from .cloud import Cloud
 from .mesh import FloatArray, vertex_normals
 from .multilinear import Mode, TongueModel
 
@@ -47,19 +48,6 @@ FIRST_DAMPING = 1e-4
 LEAST_DAMPING, LARGEST_DAMPING = 1e-12, 1e12
 ROUNDING = 1e-22  # of the squared targets: a lower energy is 0
 LEAST_SPREAD = 1e-3  # of sigma: the least deviation that is taken for measured
-
-
-@dataclass(frozen=True)
-class Cloud:
-    """A surface that is not registered to the model, in the model's frame, mm.
-
-    points: (n, 3); normals: (n, 3) unit, outwards, or None where they are not known; landmarks: vertex of the
-    model -> (3,) where it is.
-    """
-
-    points: FloatArray
-    normals: FloatArray | None = None
-    landmarks: Mapping[int, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

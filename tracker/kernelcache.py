@@ -13,6 +13,7 @@ VARIABLE = "NUMBA_CACHE_DIR"
 KERNEL_MODULES = {
     "drivers.devices.rtc3d_decode": "RTC3D",
     "model.nearest": "specificity",
+    "model.neighbours": "neighbours in point clouds",
     "model.mri.diffusion": "denoising of scans",
     "model.mri.phantom.tissue": "phantom's anatomy and volumes",
     "tracker.alignmentterms": "calibration",

@@ -7,7 +7,7 @@ import io
 import numpy as np
 
 from ... import InputError
-from ..fitting import Cloud
+from ..cloud import Cloud
 from ..mesh import FloatArray
 from .reading import library
 from .scan import Scan
