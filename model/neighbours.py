@@ -96,6 +96,20 @@ class SurfaceIndex:
         index, valid = self.nearest(vertices, normals, rule)
         return self.points[index], valid
 
+    def targets(
+        self, vertices: FloatArray, normals: FloatArray, rule: NeighbourRule
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """(n, 3) where each vertex comes to lie when it is moved straight onto the plane that touches the surface at
+        its neighbour, mm, and (n,) whether there is one; as `nearest`.
+
+        A cloud's points are a voxel apart, and the nearest one below may lie more to the side than below; what it
+        says about the surface is where that is, not which place on it the vertex belongs to.
+        """
+        index, valid = self.nearest(vertices, normals, rule)
+        across = self.normals[index]
+        apart = np.einsum("va,va->v", across, self.points[index] - vertices)
+        return vertices + across * apart[:, None], valid
+
 
 @njit(cache=True)
 def _nearest(
