@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 from ... import InputError, __version__
 from ...archive import read_arrays
 from ...atomic import write_atomically
-from ...parallel import Executor, Failed
+from ...parallel import Executor, Failed, Progress
 
 Arrays = Mapping[str, NDArray[Any]]
 LARGEST_BYTES = 1_000_000_000
 PIECE = 1 << 20
 _DIGEST_BYTES = hashlib.sha256().digest_size
+KEY_LENGTH = 2 * _DIGEST_BYTES  # hexadecimal digits
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def source(path: Path) -> Source:
 
 
 def key_of(step: Step, arguments: Sequence[Any]) -> str:
-    """64 hexadecimal digits."""
+    """KEY_LENGTH hexadecimal digits."""
     digest = hashlib.sha256()
     for part in _parts((step.name, step.version, __version__, tuple(arguments))):
         digest.update(part)
@@ -118,7 +119,7 @@ def run_step(
     step: Step,
     rows: Sequence[Sequence[Any]],
     executor: Executor,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> list[Stored | Failed]:
     """One result for each row of arguments, made where it is not kept already; where it failed, why.
 
@@ -136,7 +137,6 @@ def run_step(
     failed = {
         key: outcome for key, outcome in zip(missing, outcomes, strict=True) if isinstance(outcome, Failed)
     }
-    told(len(missing), 0)
     return [failed.get(key) or Stored(key) for key in keys]
 
 
