@@ -6,29 +6,38 @@ are made; a scheduler can therefore run code as the user who connects to it: con
 
 from __future__ import annotations
 
+import logging
+import os
 import signal
 import socket
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent import futures
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import urlsplit
 
 from . import InputError, __version__
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Progress = Callable[[int, int], None]
 """Told how many items of how many are finished, first of all 0."""
 
-AT_HAND = 3
-"""So many items for each worker are handed out ahead of the results that were taken: never idle, never all in memory."""
-FEWEST_AT_HAND = 8
-"""Also where a cluster has no worker yet; one that grows with its work has to see some."""
+UNDER_WAY = 2
+"""So many items for each worker are handed out at a time. (loky's own queue takes them all, so that it can be ended at
+once.)"""
+AT_HAND = 8
+"""So many items for each worker may be under way or finished but not yet taken, while the first of them is slow."""
 CONNECT_S = 10.0
+PARENT_WATCHED_EVERY_S = 1.0
 THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "NUMBA")
 """Libraries whose threads are counted in NAME_NUM_THREADS. The items share the cores, so each item gets one."""
 _ONE_AT_A_TIME = threading.Lock()
@@ -46,11 +55,12 @@ class Failed:
 class Executor:
     """Where work runs; made by `local` and `cluster`.
 
-    where: for people; pool: None = in this process; workers: how many there are now.
+    where: for people; submit: begins function(*arguments) in a worker, None = there is none but this process;
+    workers: how many there are now.
     """
 
     where: str
-    pool: futures.Executor | None
+    submit: Callable[..., futures.Future[Any]] | None
     workers: Callable[[], int]
 
     def run(
@@ -61,13 +71,13 @@ class Executor:
         function and items: what pickle can send, such as a module's own function (or functools.partial of one, whose
         arguments travel with every item: paths rather than arrays). Only a few items are under way at a time.
         An InputError becomes that item's Failed and the rest goes on. Any other error passes through with a note that
-        names the item. Where this iterator is given up, what has not begun is not begun.
+        names the item. Where this iterator is given up, the few items under way may still run.
         Raises InputError where a worker process or the cluster itself is lost.
         """
         progress = progress or (lambda finished, total: None)
         progress(0, len(items))
-        if self.pool is not None:
-            yield from _run_in_pool(self.pool, self.workers, function, items, progress)
+        if self.submit is not None:
+            yield from _run_in_workers(self.submit, self.workers, function, items, progress)
             return
         for finished, item in enumerate(items, 1):
             try:
@@ -106,9 +116,9 @@ def local(jobs: int | None = None) -> Iterator[Executor]:
         yield Executor("in this process", None, lambda: 1)
         return
     one_thread = {f"{name}_NUM_THREADS": "1" for name in THREADS}
-    pool = ProcessPoolExecutor(max_workers=count, env=one_thread, initializer=_leave_interrupts_to_the_parent)
+    pool = ProcessPoolExecutor(max_workers=count, env=one_thread, initializer=_depend_on_the_parent)
     try:
-        yield Executor(f"in {count} processes", pool, lambda: count)
+        yield Executor(f"in {count} processes", pool.submit, lambda: count)
     except BaseException:
         pool.shutdown(wait=True, kill_workers=True)
         raise
@@ -130,6 +140,7 @@ def cluster(address: str) -> Iterator[Executor]:
         raise InputError(
             "working on a Dask cluster needs the extra 'cluster': pip install 'tonguetrack[cluster]'."
         ) from error
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # a lost connection is told below
     try:
         _knock(address)
         client = Client(address, timeout=CONNECT_S, set_as_default=False)
@@ -139,8 +150,9 @@ def cluster(address: str) -> Iterator[Executor]:
             "'dask scheduler' prints when it starts."
         ) from error
     try:
-        pool = client.get_executor(pure=False)
-        yield Executor(_described(address, client.nthreads()), pool, lambda: len(client.nthreads()))
+        yield Executor(
+            _described(address, client.nthreads()), partial(_submit, client), lambda: len(client.nthreads())
+        )
     except KilledWorker as error:
         raise InputError(
             f"{address}: several workers in a row ended while working on the same item, most likely for want of memory."
@@ -170,8 +182,22 @@ def _described(address: str, threads: dict[str, int]) -> str:
     return text
 
 
-def _run_in_pool(
-    pool: futures.Executor,
+def _submit(client: Client, *call: Any) -> futures.Future[Any]:
+    """As an Executor's submit. dask's own (client.get_executor) waits for ever for a scheduler that is gone."""
+    promise: futures.Future[Any] = futures.Future()
+
+    def keep(done: Future) -> None:
+        try:
+            promise.set_result(done.result())
+        except BaseException as error:  # noqa: BLE001 - whatever it is, it is raised where the result is taken
+            promise.set_exception(error)
+
+    client.submit(*call, pure=False).add_done_callback(keep)
+    return promise
+
+
+def _run_in_workers(
+    submit: Callable[..., futures.Future[Any]],
     workers: Callable[[], int],
     function: Callable[[Item], Result],
     items: Sequence[Item],
@@ -183,10 +209,11 @@ def _run_in_pool(
     handed_out = 0
     try:
         while handed_out < len(items) or at_hand:
-            room = max(AT_HAND * workers(), FEWEST_AT_HAND) - len(at_hand)
+            count = max(workers(), 1)  # a cluster that grows with its work has to see some
+            room = min(UNDER_WAY * count - len(running), AT_HAND * count - len(at_hand))
             for _ in range(min(room, len(items) - handed_out)):
                 item = next(waiting)
-                future = pool.submit(_attempt_elsewhere, __version__, function, item)
+                future = submit(_attempt_elsewhere, __version__, function, item)
                 at_hand.append((item, future))
                 running.add(future)
                 handed_out += 1
@@ -199,9 +226,6 @@ def _run_in_pool(
         raise InputError(
             "a worker process was ended from outside, most likely for want of memory; try again with fewer jobs."
         ) from error
-    finally:
-        for future in running:
-            future.cancel()
 
 
 def _outcome(item: Item, future: futures.Future[Result | Failed]) -> Result | Failed:
@@ -239,6 +263,17 @@ def _name_item(error: Exception, item: object) -> None:
     error.add_note(f"This happened while working on {repr(item)[:300]}.")
 
 
-def _leave_interrupts_to_the_parent() -> None:
-    """Ctrl-C reaches every process of the terminal; the workers are ended by the one that started them."""
+def _depend_on_the_parent() -> None:
+    """In a local worker: Ctrl-C, which reaches every process of a terminal, is the parent's; the worker ends with it.
+
+    A parent that is killed has no time to end its workers, so they look whether it is still there.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_WATCHED_EVERY_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
