@@ -220,7 +220,7 @@ def _value(default: Any, value: Any, path: str, where: str) -> Any:
         if not isinstance(value, list) or not 1 <= len(value) <= 100:
             raise InputError(f"{where}: {path} should be a list of numbers, not {value!r}.")
         return tuple(_value(0.0, one, path, where) for one in value)
-    if isinstance(default, bool) or isinstance(default, str):
+    if isinstance(default, bool | str):
         if type(value) is not type(default):
             kind = "true or false" if isinstance(default, bool) else "a text"
             raise InputError(f"{where}: {path} should be {kind}, not {value!r}.")
