@@ -1,0 +1,92 @@
+"""The hard palate of every speaker, from the one scan that shows it (paper, "Tongue and palate shape estimation").
+
+The template is matched to each scan by itself. In rounds, the palates then help each other: a PCA model of all of them
+is fitted to each scan, within a narrow box, and from there the template is matched again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..mesh import FloatArray
+from ..neighbours import NeighbourRule, SurfaceIndex
+from ..pca import PcaModel, fit_pca, pca_of
+from ..procrustes import procrustes, rigid_motion
+from .dataset import Landmarks
+from .matching import Match, MatchSettings, match
+from .templates import Template, landmark_vertices, placed
+
+
+@dataclass(frozen=True)
+class PalatePriorSettings:
+    """rounds: so often the palates are matched again; h: half the width of the model's box, in sigma; energies: of
+    each of its fits. These are the paper's."""
+
+    rounds: int = 1
+    h: float = 1.0
+    energies: int = 10
+
+
+def first_match(
+    index: SurfaceIndex, landmarks: Landmarks, template: Template, settings: MatchSettings
+) -> Match:
+    """The template matched to a cloud, from where the landmarks (name -> (3,) mm) put it."""
+    return match(placed(template, landmarks), template, index, landmarks, settings)
+
+
+def palate_model(palates: Mapping[str, FloatArray], template: Template) -> PcaModel:
+    """The PCA model of palates, speaker -> (n, 3) mm, brought together without a change of size.
+
+    Raises InputError for fewer than two.
+    """
+    return pca_of(procrustes(np.array(list(palates.values())), template.mesh.vertices).shapes)
+
+
+def start_of(
+    model: PcaModel,
+    previous: FloatArray,
+    index: SurfaceIndex,
+    landmarks: Landmarks,
+    template: Template,
+    rule: NeighbourRule,
+    prior: PalatePriorSettings,
+) -> FloatArray:
+    """(n, 3) mm: the model fitted to a cloud, from where its palate was found before (n, 3)."""
+    fit = fit_pca(
+        model,
+        template.mesh.faces,
+        index,
+        landmark_vertices(template, landmarks),
+        prior.h,
+        rule,
+        rigid_motion(model.mean, previous),
+        prior.energies,
+    )
+    return fit.vertices
+
+
+def match_palates(
+    cases: Mapping[str, tuple[SurfaceIndex, Landmarks]],
+    template: Template,
+    settings: MatchSettings,
+    prior: PalatePriorSettings | None = None,
+) -> dict[str, Match]:
+    """speaker -> palate, of the clouds and landmarks of all of them. A single one has nothing to learn from."""
+    prior = prior or PalatePriorSettings()
+    found = {name: first_match(index, marks, template, settings) for name, (index, marks) in cases.items()}
+    for _ in range(prior.rounds if len(found) > 1 else 0):
+        model = palate_model({name: one.vertices for name, one in found.items()}, template)
+        found = {
+            name: match(
+                start_of(model, found[name].vertices, index, marks, template, settings.rule, prior),
+                template,
+                index,
+                marks,
+                settings,
+            )
+            for name, (index, marks) in cases.items()
+        }
+    return found
