@@ -223,7 +223,7 @@ def plan_jobs(
 ) -> tuple[list[Job], list[tuple[Path, str]]]:
     """Finds the recordings and gives each its output files; also what was left out, with the reason.
 
-    passed_over: an absolute folder in which nothing is looked for.
+    passed_over: an absolute folder; where it lies below a place, nothing is looked for in it.
     Raises InputError where there is nothing to track or two outputs would have one name.
     """
     from ...drivers import find_recordings
@@ -236,7 +236,7 @@ def plan_jobs(
             found.append(Path(place))
             continue
         items = find_recordings(place)
-        if passed_over is not None:
+        if passed_over is not None and Path(os.path.abspath(place)) in passed_over.parents:
             items = [item for item in items if passed_over not in Path(os.path.abspath(item.path)).parents]
         recordings = [item.path for item in items if item.is_recording]
         if not recordings:
