@@ -194,7 +194,7 @@ def shapes_of(index: Index, tongues: Mapping[Cell, FloatArray]) -> TrainingShape
     their speakers and phones."""
     speakers = [name for name in index.dataset.speakers if any(name == cell[0] for cell in tongues)]
     phones = [name for name in index.dataset.phones if any(name == cell[1] for cell in tongues)]
-    provenance = {"source": str(index.dataset.source), "data": index.dataset.provenance}
+    provenance = {"source": index.dataset.source.name, "data": index.dataset.provenance}
     return complete_shapes(
         tongues, speakers, phones, templates.tongue(), index.settings.completion, provenance
     )
