@@ -170,7 +170,7 @@ def failed(task: Task, reason: str) -> Row:
 
 def write_summary(rows: Iterable[Row], folder: Path) -> Path:
     """One line a recording, as CSV; an empty cell is a missing value. Returns the file."""
-    lines = [COLUMNS]
+    lines: list[Sequence[object]] = [COLUMNS]
     for row in rows:
         values = [getattr(row, name) for name in COLUMNS]
         lines.append(tuple("; ".join(v) if isinstance(v, tuple) else "" if v is None else v for v in values))
