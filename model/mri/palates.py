@@ -11,13 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ... import InputError
+from ..cloud import Cloud
 from ..mesh import FloatArray
 from ..neighbours import NeighbourRule, SurfaceIndex
 from ..pca import PcaModel, fit_pca, pca_of
 from ..procrustes import procrustes, rigid_motion
 from .dataset import Landmarks
 from .matching import Match, MatchSettings, match
+from .scan import Scan
+from .surface import otsu, surface_points
 from .templates import Template, landmark_vertices, placed
+
+AROUND_MM = 5.0  # of the palate: what its threshold comes from
 
 
 @dataclass(frozen=True)
@@ -28,6 +34,25 @@ class PalatePriorSettings:
     rounds: int = 1
     h: float = 1.0
     energies: int = 10
+
+
+def palate_surface(scan: Scan, landmarks: Landmarks, template: Template) -> Cloud:
+    """The surface of the tissue in a denoised scan, mm, with the threshold that fits around the palate.
+
+    Its mucosa is hardly thicker than a voxel, between air and bone: darker than other tissue, so that the threshold for
+    the whole scan puts its surface too deep, or misses it. Here it is Otsu's among the voxels near to where the
+    landmarks put the template. Raises InputError where that is outside of the scan, or there is no surface.
+    """
+    from scipy.spatial import cKDTree
+
+    where = np.indices(scan.values.shape).reshape(3, -1).T
+    apart_mm = cKDTree(placed(template, landmarks)).query(scan.points(where), distance_upper_bound=AROUND_MM)[
+        0
+    ]
+    around = scan.values.ravel()[apart_mm <= AROUND_MM]
+    if not len(around):
+        raise InputError(f"{scan.name}: the landmarks of the palate are outside of this scan.")
+    return surface_points(scan, otsu(around))
 
 
 def first_match(
