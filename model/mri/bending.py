@@ -166,7 +166,7 @@ def move(
 
 
 @njit(cache=True)
-def stretch(
+def bent(
     current: FloatArray,
     rotations: FloatArray,
     rest: FloatArray,
