@@ -25,6 +25,7 @@ from . import diffusion
 from .contact import ContactSettings
 from .matching import PALATE, TONGUE, MatchSettings
 from .palatealignment import ProfileSettings
+from .palates import PalatePriorSettings
 
 LARGEST_FILE = 1_000_000
 COMPLETIONS = ("averaging", "low rank")
@@ -39,15 +40,6 @@ class DenoisingSettings:
     contrast: float = diffusion.CONTRAST
     sigma_mm: float = diffusion.SIGMA_MM
     rho_mm: float = diffusion.RHO_MM
-
-
-@dataclass(frozen=True)
-class PalatePriorSettings:
-    """rounds: of bootstrapping with the PCA model; h: its box, in sigma; energies: of each fit."""
-
-    rounds: int = 1
-    h: float = 1.0
-    energies: int = 10
 
 
 @dataclass(frozen=True)
@@ -131,15 +123,12 @@ _ABOUT = {
     "pose_modes": _About("pose weights, at most; the paper's model has 4", 1, 1000),
     "smoothness": _About("weight of equal motions of neighbours, first energy (paper: 10)"),
     "least_smoothness": _About("the same, last energy (paper: 6)"),
-    "bending": _About("weight of evenly changing motions, first energy (paper: 0)"),
-    "least_bending": _About("the same, last energy (paper: 0)"),
     "landmarks": _About("weight of the landmarks, first energy (paper: 10)"),
     "tongue.least_landmarks": _About("the same, last energy (paper: 0)"),
     "palate.least_landmarks": _About("the same, last energy (paper: 10)"),
     "energies": _About("in the series, each with new neighbours (paper: 40)", 1, 1000),
     "radius_mm": _About("how far away a neighbour may be (paper: 4)", 1e-3, 1000.0),
     "angle_deg": _About("how far its normal may be turned away (paper: 60)", 1e-3, 180.0),
-    "rotations": _About("whether neighbours may turn together (paper: rigid motions)"),
     "smooth_afterwards": _About(
         "whether motions are averaged with their neighbours' at the end (paper: true)"
     ),
