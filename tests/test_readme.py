@@ -39,6 +39,7 @@ TRACK_DEMO = ".venv/bin/tonguetrack track recordings/demo.csv --session recordin
 RENDER_DEMO = ".venv/bin/tonguetrack render demo.poses.csv --session recordings/demo.session.toml"
 DEMO = ".venv/bin/tonguetrack demo --seconds 5 --to "
 WITHOUT_END = ELSEWHERE + "test_window.py and test_page_browser.py, and .ci/run for some seconds"
+BY_PREFERENCE = ELSEWHERE + "test_mri_preference.py and test_preference_page.py"
 HEADS = ".venv/bin/tonguetrack mri phantom heads --speakers 1 --seed 7"
 BY_MODEL_TESTS = ELSEWHERE + "test_model_evaluation.py, with fewer samples"
 BY_FAULTS = ELSEWHERE + "test_cli_live_devices.py and the simulators' own tests: it runs until it is ended"
@@ -102,6 +103,9 @@ DOCS = {
     ".venv/bin/tonguetrack mri segment smooth.nii.gz -o tissue.nii.gz": HERE,
     ".venv/bin/tonguetrack mri cloud smooth.nii.gz -o surface.ply": HERE,
     ".venv/bin/tonguetrack mri slice smooth.nii.gz -o slice.png --at 2.2 --cloud surface.ply": HERE,
+    ".venv/bin/tonguetrack mri preference make model.work -o test --partitions 2": BY_PREFERENCE,
+    ".venv/bin/tonguetrack mri preference serve test": BY_PREFERENCE,
+    ".venv/bin/tonguetrack mri preference tally test -o tally": BY_PREFERENCE,
     ".venv/bin/tonguetrack model evaluate speakers/samples.yaml -o report": BY_MODEL_TESTS,
     (
         ".venv/bin/tonguetrack model evaluate PATH/sampleDatabase.yaml --specificity --samples 20000 "
@@ -241,6 +245,9 @@ def test_the_flags_that_pages_name_exist():
         "mri segment",
         "mri cloud",
         "mri slice",
+        "mri preference make",
+        "mri preference serve",
+        "mri preference tally",
         "simulate recording",
         "simulate device",
         "live",
