@@ -37,22 +37,28 @@ def contour(mesh: Mesh, plane: str, at_mm: float) -> list[FloatArray]:
 
 
 def _joined(pieces: list[list[int]]) -> list[list[int]]:
-    """Pieces of two ends each as lines, open ones first; an end that is in three pieces (no surface has one) ends lines."""
-    at: dict[int, list[int]] = {}
-    for number, piece in enumerate(pieces):
+    """Pieces of two ends each as lines, open ones first. Where more than two pieces meet, which no sound surface has,
+    lines end."""
+    at: dict[int, list[list[int]]] = {}
+    for piece in pieces:
         for end in piece:
-            at.setdefault(end, []).append(number)
-    left = set(range(len(pieces)))
+            at.setdefault(end, []).append(piece)
+    passed_through = {end for end, found in at.items() if len(found) == 2}
+
+    def taken(end: int) -> list[int] | None:
+        if not at[end]:
+            return None
+        piece = at[end].pop()
+        at[piece[0] if piece[1] == end else piece[1]].remove(piece)
+        return piece
+
     lines = []
-    starts = [end for end, found in at.items() if len(found) != 2] + list(at)
-    for start in starts:
-        while any(number in left for number in at[start]):
+    for start in [*(at.keys() - passed_through), *at]:
+        while (found := taken(start)) is not None:
             line = [start]
-            while (number := next((n for n in at[line[-1]] if n in left), None)) is not None:
-                left.remove(number)
-                first, second = pieces[number]
+            while found is not None:
+                first, second = found
                 line.append(second if first == line[-1] else first)
-                if len(at[line[-1]]) != 2:
-                    break
+                found = taken(line[-1]) if line[-1] in passed_through else None
             lines.append(line)
     return lines

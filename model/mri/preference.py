@@ -46,8 +46,8 @@ MARGIN_MM = 16.0  # around the contours
 PIXEL_MM = 0.2  # of the pictures; voxels are interpolated
 QUANTILES = (0.01, 0.99)  # of their values: black and white
 DIGITS = 2  # of a mm, in contours
-MAX_TEST_BYTES = 50_000_000
-MAX_ITEMS = 9999
+MAX_TEST_BYTES = 100_000_000
+MAX_ITEMS = 5000
 MAX_PICTURE_BYTES = 20_000_000
 
 Contour = tuple[FloatArray, ...]
