@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from . import mribuild, mripreference, phantom, scansteps
+from . import mribuild, mrimatch, mripreference, phantom, scansteps
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -12,5 +12,6 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     verbs = family.add_subparsers(dest="verb", metavar="VERB", required=True)
     mribuild.add_verbs(verbs)
     scansteps.add_verbs(verbs)
+    mrimatch.add_verbs(verbs)
     phantom.add_verbs(verbs)
     mripreference.add_verbs(verbs)
