@@ -1,10 +1,10 @@
 """What a build has made, as files that people and other programs open: clouds and meshes under readable names.
 
-    SPEAKER_PHONE.points.ply   the surface points of a scan, contact restored, mm in the world of the scan
-    SPEAKER_PHONE.palate.ply   the speaker's palate in that scan
-    SPEAKER_PHONE.first.ply    the tongue after the first matching
-    SPEAKER_PHONE.tongue.ply   the tongue after the last round
-    samples.yaml, meshes/      the tongues in the frame that all heads share, which `model evaluate` reads
+SPEAKER_PHONE.points.ply   the surface points of a scan, contact restored, mm in the world of the scan
+SPEAKER_PHONE.palate.ply   the speaker's palate in that scan
+SPEAKER_PHONE.first.ply    the tongue after the first matching
+SPEAKER_PHONE.tongue.ply   the tongue after the last round
+samples.yaml, meshes/      the tongues in the frame that all heads share, which `model evaluate` reads
 """
 
 from __future__ import annotations

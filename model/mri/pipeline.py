@@ -25,8 +25,9 @@ from . import stages, templates
 from .bootstrapping import Cell, model_of
 from .caching import Cache, Source, Step, Stored, run_step, source
 from .dataset import Dataset, Problem, Region
+from .palates import palate_model
 from .results import Index, is_sound, motions_of, shapes_of, tongues_in_head
-from .settings import BuildSettings
+from .settings import BuildSettings, DenoisingSettings
 
 Name = TypeVar("Name")
 Watch = Callable[[str], AbstractContextManager[Progress | None]]
@@ -93,6 +94,17 @@ class _Making:
         problems = [Problem(*cell, _sentence(cell, reason)) for cell, reason in failures.items()]
         return keys, replace(index, dataset=index.dataset.without(problems))
 
+    def of_speakers(
+        self, what: str, step: Step, rows: Mapping[str, Sequence[Any]], index: Index
+    ) -> tuple[dict[str, str], Index]:
+        """The same for the palates of speakers; who has none is left out with all scans."""
+        keys, failures = self.made(what, step, rows)
+        problems = [
+            Problem(name, None, f"{name}: the palate cannot be extracted, all scans are left out: {reason}")
+            for name, reason in failures.items()
+        ]
+        return keys, replace(index, dataset=index.dataset.without(problems))
+
 
 # The stages --------------------------------------------------------------------------------------------
 
@@ -105,21 +117,52 @@ def _scans(index: Index, making: _Making) -> Index:
         except InputError as reason:
             problems.append(Problem(*cell, _sentence(cell, str(reason))))
     index = replace(index, dataset=index.dataset.without(problems), digests=digests)
-    denoising = index.settings.denoising if index.settings.denoise else None
-    rows = {cell: (*_file(index, cell), denoising) for cell in index.dataset.scans}
+    rows = {cell: (*_file(index, cell), _denoising(index)) for cell in index.dataset.scans}
     surfaces, index = making.of_scans("surfaces of the scans", stages.SURFACE, rows, index)
     return replace(index, surfaces=surfaces)
 
 
 def _palates(index: Index, making: _Making) -> Index:
-    rows = {}
-    for speaker, phone in index.dataset.palate_phone.items():
-        cell = speaker, phone
-        marked = index.dataset.scans[cell].palate_landmarks
-        rows[speaker] = (Stored(index.surfaces[cell]), templates.palate(), marked, index.settings.palate)
-    keys, failures = making.made("palates matched", stages.MATCHED, rows)
-    problems = [Problem(name, None, f"{name}: {reason}") for name, reason in failures.items()]
-    return replace(index, palates=keys, dataset=index.dataset.without(problems))
+    settings, template = index.settings, templates.palate()
+    marked = {
+        name: index.dataset.scans[name, index.dataset.palate_phone[name]].palate_landmarks
+        for name in index.dataset.speakers
+    }
+    rows = {
+        name: (
+            *_file(index, (name, index.dataset.palate_phone[name])),
+            _denoising(index),
+            template,
+            marked[name],
+        )
+        for name in index.dataset.speakers
+    }
+    clouds, index = making.of_speakers("surfaces of the palates", stages.PALATE_SURFACE, rows, index)
+    rows = {
+        name: (Stored(clouds[name]), template, marked[name], settings.palate)
+        for name in index.dataset.speakers
+    }
+    keys, index = making.of_speakers("palates matched", stages.PALATE, rows, index)
+    for number in range(1, settings.palate_prior.rounds + 1):
+        if len(index.dataset.speakers) < 2:
+            break  # a single palate has nothing to learn from
+        known = {name: making.cache.load(keys[name])["vertices"] for name in index.dataset.speakers}
+        model = palate_model(known, template)
+        rows = {
+            name: (
+                Stored(clouds[name]),
+                template,
+                marked[name],
+                settings.palate,
+                model,
+                settings.palate_prior,
+                Stored(keys[name]),
+            )
+            for name in index.dataset.speakers
+        }
+        what = f"palates matched again, round {number} of {settings.palate_prior.rounds}"
+        keys, index = making.of_speakers(what, stages.PALATE_AGAIN, rows, index)
+    return replace(index, palates=keys)
 
 
 def _aligned(index: Index, making: _Making) -> Index:
@@ -242,6 +285,10 @@ def _with_tongues(index: Index, making: _Making) -> Index:
 def _file(index: Index, cell: Cell) -> tuple[Source, Region | None]:
     entry = index.dataset.scans[cell]
     return Source(entry.path, index.digests[cell]), entry.region
+
+
+def _denoising(index: Index) -> DenoisingSettings | None:
+    return index.settings.denoising if index.settings.denoise else None
 
 
 def _sentence(cell: Cell, reason: str) -> str:

@@ -17,7 +17,9 @@ from ..completion import held_out_errors
 from ..mesh import FloatArray, Mesh, vertex_normals
 from ..multilinear import TongueModel
 from ..neighbours import SurfaceIndex
+from ..pca import PcaModel
 from ..procrustes import RigidMotion
+from . import palates
 from .bootstrapping import fitted
 from .caching import Arrays, Source, Step
 from .contact import ContactSettings, restore_contact
@@ -41,13 +43,55 @@ def scan_at(file: Source, region: Region | None) -> Scan:
     return scan.quantised()
 
 
-def _surface(file: Source, region: Region | None, denoising: DenoisingSettings | None) -> Arrays:
+def denoised(file: Source, region: Region | None, settings: DenoisingSettings | None) -> Scan:
+    """The same without its noise; as it is where settings is None."""
     scan = scan_at(file, region)
-    if denoising is not None:
-        d = denoising
-        values = denoise(scan.values, scan.spacing_mm, d.steps, d.step_mm2, d.contrast, d.sigma_mm, d.rho_mm)
-        scan = scan.holding(values)
-    return _cloud_arrays(surface_points(scan))
+    if settings is None:
+        return scan
+    with_ = settings
+    values = denoise(
+        scan.values,
+        scan.spacing_mm,
+        with_.steps,
+        with_.step_mm2,
+        with_.contrast,
+        with_.sigma_mm,
+        with_.rho_mm,
+    )
+    return scan.holding(values)
+
+
+def _surface(file: Source, region: Region | None, denoising: DenoisingSettings | None) -> Arrays:
+    return _cloud_arrays(surface_points(denoised(file, region, denoising)))
+
+
+def _palate_surface(
+    file: Source,
+    region: Region | None,
+    denoising: DenoisingSettings | None,
+    template: Template,
+    landmarks: Landmarks,
+) -> Arrays:
+    return _cloud_arrays(palates.palate_surface(denoised(file, region, denoising), landmarks, template))
+
+
+def _palate(cloud: Stored, template: Template, landmarks: Landmarks, settings: MatchSettings) -> Arrays:
+    index = SurfaceIndex(cloud_of(cloud))
+    return match_arrays(palates.first_match(index, landmarks, template, settings))
+
+
+def _palate_again(
+    cloud: Stored,
+    template: Template,
+    landmarks: Landmarks,
+    settings: MatchSettings,
+    model: PcaModel,
+    prior: palates.PalatePriorSettings,
+    previous: Stored,
+) -> Arrays:
+    index = SurfaceIndex(cloud_of(cloud))
+    start = palates.start_of(model, previous["vertices"], index, landmarks, template, settings.rule, prior)
+    return match_arrays(match(start, template, index, landmarks, settings))
 
 
 def _aligned(
@@ -128,6 +172,9 @@ def _cloud_arrays(cloud: Cloud) -> Arrays:
 
 
 SURFACE = Step("surface", 1, _surface)
+PALATE_SURFACE = Step("palate surface", 1, _palate_surface)
+PALATE = Step("palate", 1, _palate)
+PALATE_AGAIN = Step("palate again", 1, _palate_again)
 ALIGNED = Step("aligned", 1, _aligned)
 RESTORED = Step("restored", 1, _restored)
 MATCHED = Step("matched", 1, _matched)
