@@ -163,3 +163,23 @@ def test_the_steps_can_be_taken_one_after_the_other(phantom, work, tmp_path):
         assembled(work, index)
     write_index(tmp_path, index)
     assert read_index(tmp_path).clouds == index.clouds
+
+
+def test_people_can_be_asked_which_of_its_contours_they_prefer(work, tmp_path, capsys):
+    """`mri preference make`: every scan with the contours before and after bootstrapping, near the true middle."""
+    from tonguetrack.model.mri.preference import load_test
+
+    arguments = ["-o", str(tmp_path / "test"), "--partitions", "2"]
+    assert main(["mri", "preference", "make", str(work), *arguments]) == 0
+    assert "6 slices in 2 partitions" in capsys.readouterr().err
+    test, result = load_test(tmp_path / "test"), load_result(work)
+    assert test.synthetic and [(item.speaker, item.phone) for item in test.items] == list(result.scans)
+    for item in test.items:
+        scan = result.scans[item.speaker, item.phone]
+        tip = scan.final[result.tongue.landmarks["Tip"], 0]
+        assert abs(item.at_mm - tip) < 4.0
+        for mesh, lines in ((scan.initial, item.initial), (scan.final, item.final)):
+            near = mesh[np.abs(mesh[:, 0] - item.at_mm) < 1.5]
+            along = np.vstack(lines)
+            assert np.ptp(along[:, 1]) == pytest.approx(np.ptp(near[:, 2]), abs=1.5)
+            assert np.ptp(along[:, 0]) == pytest.approx(np.ptp(near[:, 1]), abs=1.5)
