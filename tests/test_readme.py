@@ -42,6 +42,7 @@ WITHOUT_END = ELSEWHERE + "test_window.py and test_page_browser.py, and .ci/run 
 BY_PREFERENCE = ELSEWHERE + "test_mri_preference.py and test_preference_page.py"
 HEADS = ".venv/bin/tonguetrack mri phantom heads --speakers 1 --seed 7"
 BY_MODEL_TESTS = ELSEWHERE + "test_model_evaluation.py, with fewer samples"
+BY_CORPUS_TESTS = ELSEWHERE + "test_corpus.py, with dask's own local cluster"
 BY_FAULTS = ELSEWHERE + "test_cli_live_devices.py and the simulators' own tests: it runs until it is ended"
 
 README = {
@@ -169,6 +170,10 @@ DOCS = {
     " --save-session speaker.toml --use joint": HERE,
     ".venv/bin/tonguetrack anatomy recordings/demo.csv --session session.toml"
     " --mesh tongue_000500.ply tongue_001500.ply tongue_002500.ply": HERE,
+    ".venv/bin/tonguetrack track recordings --out-folder poses": HERE,
+    ".venv/bin/tonguetrack track corpus --out-folder poses --scheduler tcp://192.168.0.7:8786": BY_CORPUS_TESTS,
+    ".venv/bin/dask scheduler": BY_CORPUS_TESTS,
+    ".venv/bin/dask worker tcp://192.168.0.7:8786 --nworkers auto --nthreads 1": BY_CORPUS_TESTS,
     ".venv/bin/tonguetrack convert recordings/demo.csv demo.npz": HERE,
     ".venv/bin/tonguetrack simulate recording hello.csv --speaker 5 --palate hello.palate.csv": HERE,
     ".venv/bin/tonguetrack track recordings/demo.csv --palate recordings/demo.palate.csv --save-session session.toml": HERE,
