@@ -53,7 +53,7 @@ class ProfileSettings:
     length: int = 15
     distance_mm: float = 1.0
     first: int = 1
-    smoothing_mm: tuple[float, ...] = (2.5, 1.2, 0.6)
+    smoothing_mm: tuple[float, ...] = (2.5, 1.2, 0.3)
     shifts_mm: tuple[float, ...] = (-4.0, 0.0, 4.0)
     nods_deg: tuple[float, ...] = (-4.0, 0.0, 4.0)
     followed: int = 4
