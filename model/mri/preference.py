@@ -31,8 +31,9 @@ from .contours import contour
 from .dataset import Problem
 from .reading import library
 from .results import BuildResult
-from .scan import Scan, read_scan
+from .scan import Scan
 from .slicepicture import slice_values
+from .stages import scan_at
 
 INITIAL, FINAL = "initial", "final"
 METHODS = (INITIAL, FINAL)
@@ -126,13 +127,10 @@ def cases_of(result: BuildResult) -> Iterator[tuple[str, str, Case | InputError]
     faces, middle = result.tongue.mesh.faces, list(result.palate.marks.midsagittal)
     for (speaker, phone), found in result.scans.items():
         try:
-            scan = read_scan(found.entry.path)
-            if found.entry.region is not None:
-                scan = scan.cropped(found.entry.region.low_mm, found.entry.region.high_mm)
             case: Case | InputError = Case(
                 speaker,
                 phone,
-                scan.quantised(),
+                scan_at(found.entry.path, found.entry.region),
                 Mesh(found.initial, faces),
                 Mesh(found.final, faces),
                 float(found.palate[middle, 0].mean()),

@@ -7,6 +7,7 @@ are mm in the world of the scan, x left, y back, z up; those of clouds are kept 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,9 +36,9 @@ from .templates import Template, placed
 Stored = Mapping[str, NDArray[Any]]
 
 
-def scan_at(file: Source, region: Region | None) -> Scan:
+def scan_at(path: Path, region: Region | None) -> Scan:
     """The scan, cropped, in 8-bit grey values. Raises InputError where it cannot be read."""
-    scan = read_scan(file.path)
+    scan = read_scan(path)
     if region is not None:
         scan = scan.cropped(region.low_mm, region.high_mm)
     return scan.quantised()
@@ -45,7 +46,7 @@ def scan_at(file: Source, region: Region | None) -> Scan:
 
 def denoised(file: Source, region: Region | None, settings: DenoisingSettings | None) -> Scan:
     """The same without its noise; as it is where settings is None."""
-    scan = scan_at(file, region)
+    scan = scan_at(file.path, region)
     if settings is None:
         return scan
     with_ = settings
@@ -108,7 +109,9 @@ def _aligned(
     if own == file:
         return _alignment(vertices, 1.0, "")
     normals = vertex_normals(vertices, template.mesh.faces)
-    found = align_palate(vertices, normals, scan_at(own, own_region), scan_at(file, region), settings)
+    found = align_palate(
+        vertices, normals, scan_at(own.path, own_region), scan_at(file.path, region), settings
+    )
     return _alignment(found.motion.apply(vertices), found.score, found.reason)
 
 
