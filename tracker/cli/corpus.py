@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ... import InputError
+from . import EXIT_LEFT_OUT
 from .names import BUNDLED, keep_apart, named_model, parsed_coils, prepare_folder
 from .workers import bar, workers
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from ..session import Session
     from .track import Job
 
-EXIT_LEFT_OUT = 3
 OTHER_OUTPUTS = ("out", "osc", "view", "palate", "save_session", "realtime")
 
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from . import EXIT_LEFT_OUT
 from .workers import add_worker_flags, bar, workers
 
 if TYPE_CHECKING:
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from ...model.mri.settings import BuildSettings
 
 STAGES = ("scans", "palates", "aligned", "clouds", "matched", "tongues")
-EXIT_LEFT_OUT = 3
 SUSPICIOUS = 5  # scans that are named in the end, at most; the report has all
 
 

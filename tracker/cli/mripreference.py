@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 
+from . import EXIT_LEFT_OUT
+
 MIDDLE = "mid"
 DEFAULT_PLACE = "127.0.0.1:8080"
-EXIT_LEFT_OUT = 3
 
 
 def add_verbs(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
