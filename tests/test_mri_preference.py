@@ -1,6 +1,7 @@
 """The preference test: what is made, in which order it is shown, that no choice is lost, and how choices are counted."""
 
 import csv
+import errno
 import io
 import json
 import shutil
@@ -116,11 +117,11 @@ def test_nothing_in_a_slice_tells_the_two_contours_apart_but_their_lines(made):
 
 
 def test_several_slices_of_one_scan_are_in_one_partition(tmp_path):
-    test = small_test(tmp_path / "test", offsets_mm=(0.0, 5.0, -5.0))
+    test = small_test(tmp_path / "test", speakers=2, offsets_mm=(0.0, 5.0, -5.0))
     groups = {}
     for item in test.items:
         groups.setdefault((item.speaker, item.phone), []).append(item)
-    assert len(groups) == 11 and {len(items) for items in groups.values()} == {3}
+    assert len(groups) == 7 and {len(items) for items in groups.values()} == {3}
     assert all(len({item.partition for item in items}) == 1 for items in groups.values())
     assert [item.at_mm - CENTRE_MM[0] for item in test.items[:3]] == [0.0, 5.0, -5.0]
     halves = [np.ptp(np.vstack(item.final), axis=0)[0] / 2 for item in test.items[:3]]
@@ -128,7 +129,9 @@ def test_several_slices_of_one_scan_are_in_one_partition(tmp_path):
 
 
 def test_other_seeds_make_other_partitions_and_the_same_seed_the_same(tmp_path):
-    one, same, other = (small_test(tmp_path / str(n), seed=seed) for n, seed in enumerate((1, 1, 2)))
+    one, same, other = (
+        small_test(tmp_path / str(number), speakers=2, seed=seed) for number, seed in enumerate((1, 1, 2))
+    )
     assert one.fingerprint == same.fingerprint
     assert [item.partition for item in one.items] != [item.partition for item in other.items]
 
@@ -177,6 +180,7 @@ def built(folder, final, initial=None):
         scans={("A", "i"): found, ("A", "e"): lost},
         tongue=SimpleNamespace(mesh=final),
         palate=SimpleNamespace(marks=SimpleNamespace(midsagittal=(1, 2))),
+        shapes=SimpleNamespace(provenance={"data": SYNTHETIC}),
     )
 
 
@@ -296,7 +300,7 @@ def test_choices_are_there_again_and_the_last_one_about_a_slice_counts(test):
     assert known_sitting(test, "Bert") is None
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(data=st.data())
 def test_wherever_a_file_is_cut_off_the_choices_before_are_kept_and_it_goes_on(made, tmp_path_factory, data):
     test = replace(made, folder=tmp_path_factory.mktemp("cut"))
@@ -318,6 +322,29 @@ def test_wherever_a_file_is_cut_off_the_choices_before_are_kept_and_it_goes_on(m
         again.chosen == sitting.chosen and 4 in again.chosen and len(again.chosen) == max(complete - 1, 0) + 1
     )
     assert again.damaged <= 1
+
+
+def test_every_choice_is_on_the_disk_before_the_next_one(test, monkeypatch):
+    (test.folder / "answers").mkdir()
+    synced = []
+
+    def fsync(handle):
+        synced.append(sum(path.read_bytes().count(b"\n") for path in (test.folder / "answers").iterdir()))
+
+    monkeypatch.setattr("os.fsync", fsync)
+    judge(test, "Anna", always(FINAL), count=3)
+    assert synced == [1, 2, 3, 4]  # the name and three choices, each written whole when it is synced
+
+
+def test_a_choice_that_the_disk_does_not_take_is_one_sentence(test, monkeypatch):
+    sitting = judge(test, "Anna", always(FINAL), count=1)
+
+    def full(handle):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(InputError, match="answer cannot be kept .No space left"):
+        choose(test, sitting, 1, "left", NOW)
 
 
 def test_a_line_that_nobody_can_read_is_counted_and_costs_no_other(test):
@@ -464,6 +491,19 @@ def test_a_scan_that_nobody_has_judged_is_told_apart_from_one_that_lost(test):
 
 def run(*arguments):
     return main(["mri", "preference", *map(str, arguments)])
+
+
+def test_a_build_of_which_a_scan_has_gone_gives_the_rest_a_sentence_and_exit_code_3(
+    tmp_path, monkeypatch, capsys
+):
+    found = built(tmp_path, ball_mesh(9.0), ball_mesh(11.0))
+    monkeypatch.setattr("tonguetrack.model.mri.results.load_result", lambda work: found)
+    assert run("make", "work", "-o", tmp_path / "test", "--partitions", 1, "--slices", "mid,-4") == 3
+    said = capsys.readouterr().err
+    assert "2 slices in 1 partition;" in said and "left out: A [e]: " in said and "gone.nii" in said
+    test = load_test(tmp_path / "test")
+    assert [item.at_mm for item in test.items] == pytest.approx([CENTRE_MM[0], CENTRE_MM[0] - 4])
+    assert test.source == "set.toml" and test.synthetic
 
 
 def test_the_tally_command_prints_and_writes(test, tmp_path, capsys):

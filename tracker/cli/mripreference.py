@@ -78,9 +78,10 @@ def run_make(args: argparse.Namespace) -> int:
         offsets,
         args.seed,
     )
+    parts = f"{test.partitions} partition{'s' * (test.partitions > 1)}"
     print(
-        f"{args.output}: {len(test.items)} slices in {test.partitions} partitions; show them with 'tonguetrack mri "
-        f"preference serve {args.output}'",
+        f"{args.output}: {len(test.items)} slices in {parts}; show them with 'tonguetrack mri preference serve "
+        f"{args.output}'",
         file=sys.stderr,
     )
     for problem in problems:
