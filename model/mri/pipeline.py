@@ -50,7 +50,7 @@ def build(
 
     until: the last of STAGES to be taken. Raises InputError where nothing is left to go on with.
     """
-    lately = _Making(Cache(Path(work)), executor, watch)
+    lately = _Making(Cache(Path(work).absolute()), executor, watch)
     index = Index(
         dataset.requiring_landmarks(templates.tongue().landmarks, templates.palate().landmarks), settings
     )
@@ -128,7 +128,7 @@ def _palates(index: Index, making: _Making) -> Index:
         name: index.dataset.scans[name, index.dataset.palate_phone[name]].palate_landmarks
         for name in index.dataset.speakers
     }
-    rows = {
+    rows: dict[str, tuple[Any, ...]] = {
         name: (
             *_file(index, (name, index.dataset.palate_phone[name])),
             _denoising(index),
@@ -284,7 +284,7 @@ def _with_tongues(index: Index, making: _Making) -> Index:
 
 def _file(index: Index, cell: Cell) -> tuple[Source, Region | None]:
     entry = index.dataset.scans[cell]
-    return Source(entry.path, index.digests[cell]), entry.region
+    return Source(entry.path.absolute(), index.digests[cell]), entry.region
 
 
 def _denoising(index: Index) -> DenoisingSettings | None:

@@ -340,12 +340,15 @@ def _places(landmarks: Landmarks) -> dict[str, list[float]]:
 
 
 def _entry(row: Mapping[str, Any]) -> ScanEntry:
-    def places(table: Mapping[str, Any] | None) -> dict[str, FloatArray] | None:
-        return table and {str(name): _corner(place) for name, place in table.items()}
+    def places(table: Mapping[str, Any]) -> dict[str, FloatArray]:
+        return {str(name): _corner(place) for name, place in table.items()}
 
-    region = row["region"] and Region(*map(_corner, row["region"]))
+    palate, region = row["palate_landmarks"], row["region"]
     return ScanEntry(
-        Path(row["path"]), places(row["tongue_landmarks"]) or {}, places(row["palate_landmarks"]), region
+        Path(row["path"]),
+        places(row["tongue_landmarks"]),
+        None if palate is None else places(palate),
+        None if region is None else Region(*map(_corner, region)),
     )
 
 

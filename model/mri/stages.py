@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ... import InputError
 from ..cloud import Cloud
 from ..completion import held_out_errors
 from ..mesh import FloatArray, Mesh, vertex_normals
@@ -34,6 +35,8 @@ from .surface import surface_points
 from .templates import Template, placed
 
 Stored = Mapping[str, NDArray[Any]]
+# Root mean square; 2 to 6 on phantoms, 8 to 20 with any two of the tongue's landmarks exchanged.
+MOST_APART_MM = 9.0
 
 
 def scan_at(path: Path, region: Region | None) -> Scan:
@@ -77,6 +80,7 @@ def _palate_surface(
 
 
 def _palate(cloud: Stored, template: Template, landmarks: Landmarks, settings: MatchSettings) -> Arrays:
+    _check_landmarks(template, landmarks)
     index = SurfaceIndex(cloud_of(cloud))
     return match_arrays(palates.first_match(index, landmarks, template, settings))
 
@@ -130,8 +134,25 @@ def _restored(cloud: Stored, aligned: Stored, template: Template, settings: Cont
 
 def _matched(cloud: Stored, template: Template, landmarks: Landmarks, settings: MatchSettings) -> Arrays:
     """The first matching: from where the landmarks put the template."""
+    _check_landmarks(template, landmarks)
     index = SurfaceIndex(cloud_of(cloud))
     return match_arrays(match(placed(template, landmarks), template, index, landmarks, settings))
+
+
+def _check_landmarks(template: Template, landmarks: Landmarks) -> None:
+    """Raises InputError where they are so far from the template's, brought to them, that some must be exchanged."""
+    start = placed(template, landmarks)
+    apart = {
+        name: float(np.linalg.norm(start[template.landmarks[name]] - place))
+        for name, place in landmarks.items()
+    }
+    apart_mm = float(np.sqrt(np.mean(np.square(list(apart.values())))))
+    if apart_mm > MOST_APART_MM:
+        worst = sorted(apart, key=lambda name: -apart[name])[:2]
+        raise InputError(
+            f"the landmarks of the {template.name} are {apart_mm:.0f} mm from where one has them, {' and '.join(worst)} "
+            "most of all; are two of them exchanged, or left and right?"
+        )
 
 
 def _rematched(
