@@ -21,7 +21,7 @@ from ..mesh import FloatArray, IndexArray
 
 SETTLED_MM = 1e-4  # root mean square of what a solution would still be moved by one relaxation
 MOST_STEPS = 300  # of conjugate gradients
-TURNS = 20  # of the search for a rotation
+TURNS = 100  # of the search for a rotation, at most
 SETTLED_RAD = 1e-6
 
 
@@ -56,10 +56,11 @@ def turn(
 ) -> None:
     """Makes of rotations (n, 3, 3) those that best take every vertex's edges of rest to those of current, (n, 3) mm.
 
-    Starting from what is there. The proper rotation of largest correlation, found by turning towards it: never a
-    reflection, and defined for the flat ring of edges that a vertex has.
+    Starting from what is there. The proper rotation of largest correlation, found by Newton's method: never a reflection,
+    and defined for the flat ring of edges that a vertex has.
     """
     moved = np.empty((3, 3))  # correlation of edges, rows: current, columns: rest
+    p = np.empty((3, 3))
     for i in range(len(rest)):
         moved[:] = 0.0
         for e in range(starts[i], starts[i + 1]):
@@ -69,19 +70,29 @@ def turn(
                     moved[a, b] += (current[j, a] - current[i, a]) * (rest[j, b] - rest[i, b])
         r = rotations[i]
         for _ in range(TURNS):
-            # R moves towards the correlation: the torque of its columns over their agreement.
-            x = y = z = agreement = 0.0
-            for b in range(3):
-                x += r[1, b] * moved[2, b] - r[2, b] * moved[1, b]
-                y += r[2, b] * moved[0, b] - r[0, b] * moved[2, b]
-                z += r[0, b] * moved[1, b] - r[1, b] * moved[0, b]
-                agreement += r[0, b] * moved[0, b] + r[1, b] * moved[1, b] + r[2, b] * moved[2, b]
-            scale = 1.0 / (abs(agreement) + 1e-9)
-            x, y, z = x * scale, y * scale, z * scale
+            # With P = moved R', R is turned by w: tr(P) + w.t - w'(tr(S) 1 - S) w / 2 agreement, S the even part of P.
+            for a in range(3):
+                for b in range(3):
+                    p[a, b] = moved[a, 0] * r[b, 0] + moved[a, 1] * r[b, 1] + moved[a, 2] * r[b, 2]
+            t0, t1, t2 = p[2, 1] - p[1, 2], p[0, 2] - p[2, 0], p[1, 0] - p[0, 1]
+            agreement = p[0, 0] + p[1, 1] + p[2, 2]
+            d0, d1, d2 = agreement - p[0, 0], agreement - p[1, 1], agreement - p[2, 2]
+            e01, e02, e12 = -0.5 * (p[0, 1] + p[1, 0]), -0.5 * (p[0, 2] + p[2, 0]), -0.5 * (p[1, 2] + p[2, 1])
+            c00, c01, c02 = d1 * d2 - e12 * e12, e02 * e12 - e01 * d2, e01 * e12 - e02 * d1
+            determinant = d0 * c00 + e01 * c01 + e02 * c02
+            if d0 > 0.0 and d0 * d1 - e01 * e01 > 0.0 and determinant > 1e-12 * d0 * d1 * d2:
+                c11, c12, c22 = d0 * d2 - e02 * e02, e01 * e02 - d0 * e12, d0 * d1 - e01 * e01
+                x = (c00 * t0 + c01 * t1 + c02 * t2) / determinant
+                y = (c01 * t0 + c11 * t1 + c12 * t2) / determinant
+                z = (c02 * t0 + c12 * t1 + c22 * t2) / determinant
+            else:  # far from it the curvature misleads; the torque still shows the way
+                scale = 1.0 / (abs(agreement) + 1e-9)
+                x, y, z = t0 * scale, t1 * scale, t2 * scale
             angle = np.sqrt(x * x + y * y + z * z)
             if angle < SETTLED_RAD:
                 break
             x, y, z = x / angle, y / angle, z / angle
+            angle = min(angle, 1.0)
             c, s = np.cos(angle), np.sin(angle)
             for b in range(3):
                 u, v, w = r[0, b], r[1, b], r[2, b]
