@@ -32,7 +32,7 @@ from .dataset import Problem
 from .reading import library
 from .results import BuildResult
 from .scan import Scan
-from .slicepicture import slice_values
+from .slicepicture import magnified, slice_values
 from .stages import scan_at
 
 INITIAL, FINAL = "initial", "final"
@@ -45,7 +45,6 @@ FORMAT, VERSION = "tonguetrack preference test", 1
 PARTITIONS = 4
 MARGIN_MM = 16.0  # around the contours
 PIXEL_MM = 0.2  # of the pictures; voxels are interpolated
-QUANTILES = (0.01, 0.99)  # of their values: black and white
 DIGITS = 2  # of a mm, in contours
 MAX_TEST_BYTES = 100_000_000
 MAX_ITEMS = 5000
@@ -267,32 +266,7 @@ def _drawn(case: Case, at_mm: float) -> tuple[Item, bytes]:
         tuple((line - corner) * [1.0, -1.0] for line in initial),
         tuple((line - corner) * [1.0, -1.0] for line in final),
     )
-    return item, _png(_magnified(values, edges, low, high))
-
-
-def _magnified(
-    values: FloatArray, edges: tuple[float, float, float, float], low: FloatArray, high: FloatArray
-) -> NDArray[np.uint8]:
-    """(down, right) the part of a slice between two corners in pixels of about PIXEL_MM, as bright as it can be: a bright
-    spot elsewhere in the scan shall not make it dark."""
-    from scipy.ndimage import map_coordinates
-
-    pixel = (edges[1] - edges[0]) / values.shape[1]
-    count = np.maximum(np.round((high - low) / PIXEL_MM).astype(int), 1)
-    right, up = (
-        (
-            low[axis]
-            + (np.arange(count[axis]) + 0.5) / count[axis] * (high[axis] - low[axis])
-            - edges[2 * axis]
-        )
-        / pixel
-        - 0.5
-        for axis in (0, 1)
-    )
-    grid = np.meshgrid(up[::-1], right, indexing="ij")
-    pixels = map_coordinates(np.nan_to_num(values), grid, order=3, mode="nearest")
-    black, white = np.quantile(pixels, QUANTILES)
-    return np.clip(np.rint((pixels - black) * (255.0 / max(white - black, 1.0))), 0, 255).astype(np.uint8)
+    return item, _png(magnified(values, edges, low, high, PIXEL_MM))
 
 
 def _png(pixels: NDArray[np.uint8]) -> bytes:
