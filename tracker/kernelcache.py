@@ -17,6 +17,7 @@ KERNEL_MODULES = {
     "model.surfacedistance": "distances to the truth",
     "model.mri.bending": "template matching",
     "model.mri.diffusion": "denoising of scans",
+    "model.mri.palatealignment": "alignment of palates",
     "model.mri.phantom.tissue": "phantom's anatomy and volumes",
     "tracker.alignmentterms": "calibration",
     "tracker.anatomy": "joint speaker",

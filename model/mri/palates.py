@@ -91,27 +91,3 @@ def start_of(
         prior.energies,
     )
     return fit.vertices
-
-
-def match_palates(
-    cases: Mapping[str, tuple[SurfaceIndex, Landmarks]],
-    template: Template,
-    settings: MatchSettings,
-    prior: PalatePriorSettings | None = None,
-) -> dict[str, Match]:
-    """speaker -> palate, of the clouds and landmarks of all of them. A single one has nothing to learn from."""
-    prior = prior or PalatePriorSettings()
-    found = {name: first_match(index, marks, template, settings) for name, (index, marks) in cases.items()}
-    for _ in range(prior.rounds if len(found) > 1 else 0):
-        model = palate_model({name: one.vertices for name, one in found.items()}, template)
-        found = {
-            name: match(
-                start_of(model, found[name].vertices, index, marks, template, settings.rule, prior),
-                template,
-                index,
-                marks,
-                settings,
-            )
-            for name, (index, marks) in cases.items()
-        }
-    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from . import mribuild, mrimatch, mripreference, phantom, scansteps
+from . import mribuild, mrimatch, mripalate, mripreference, phantom, scansteps
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -13,5 +13,6 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     mribuild.add_verbs(verbs)
     scansteps.add_verbs(verbs)
     mrimatch.add_verbs(verbs)
+    mripalate.add_verbs(verbs)
     phantom.add_verbs(verbs)
     mripreference.add_verbs(verbs)
