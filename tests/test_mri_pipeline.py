@@ -183,3 +183,252 @@ def test_people_can_be_asked_which_of_its_contours_they_prefer(work, tmp_path, c
             along = np.vstack(lines)
             assert np.ptp(along[:, 1]) == pytest.approx(np.ptp(near[:, 2]), abs=1.5)
             assert np.ptp(along[:, 0]) == pytest.approx(np.ptp(near[:, 1]), abs=1.5)
+
+
+def test_workers_elsewhere_are_told_whole_paths(phantom, work, monkeypatch):
+    monkeypatch.chdir(phantom.parent)
+    places = []
+
+    class Looking(Counting):
+        def run(self, function, items, progress=None):
+            places.append(function.args[0].folder)
+            return super().run(function, items, progress)
+
+    build(load_dataset("dataset.toml"), QUICK, os.path.relpath(work), Looking(), until="scans")
+    assert [place.is_absolute() for place in places] == [True]
+
+
+# What fails -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def spoiled(phantom, tmp_path) -> Path:
+    return copied(phantom, tmp_path / "set")
+
+
+NO_ROUNDS = replace(QUICK, rounds=0)
+
+
+def left_out(path, work):
+    index, _ = built(load_dataset(path), NO_ROUNDS, work)
+    return index, {(problem.speaker, problem.phone): problem.sentence for problem in index.dataset.problems}
+
+
+def test_a_corrupt_volume_is_left_out_and_named(spoiled, work):
+    scan = spoiled.parent / "scans" / "Speaker02_i.nii.gz"
+    scan.write_bytes(scan.read_bytes()[:20_000])
+    index, problems = left_out(spoiled, work)
+    assert list(problems) == [("Speaker02", "i")]
+    assert "Speaker02 [i]" in problems["Speaker02", "i"] and scan.name in problems["Speaker02", "i"]
+    assert set(index.used) == set(load_dataset(spoiled).scans) - {("Speaker02", "i")}
+    assert assembled(work, index).shapes.filled == (("Speaker02", "i"),)
+
+
+def test_a_volume_that_shows_nothing_is_left_out(spoiled, work):
+    import nibabel
+
+    path = spoiled.parent / "scans" / "Speaker01_i.nii.gz"
+    whole = nibabel.load(path)
+    nibabel.Nifti1Image(np.full(whole.shape, 100, dtype=np.float32), whole.affine).to_filename(path)
+    _, problems = left_out(spoiled, work)
+    assert list(problems) == [("Speaker01", "i")] and "nothing to see" in problems["Speaker01", "i"]
+
+
+def test_a_scan_without_a_landmark_is_left_out_and_the_landmark_named(spoiled, work):
+    marks = spoiled.parent / "landmarks" / "Speaker01_i.csv"
+    lines = marks.read_text().splitlines(keepends=True)
+    marks.write_text("".join(line for line in lines if not line.startswith("Airway")))
+    _, problems = left_out(spoiled, work)
+    assert list(problems) == [("Speaker01", "i")] and "Airway" in problems["Speaker01", "i"]
+
+
+def test_exchanged_landmarks_are_noticed(spoiled, work):
+    marks = spoiled.parent / "landmarks" / "Speaker01_i.csv"
+    text = marks.read_text().replace("LeftLateral", "?").replace("RightLateral", "LeftLateral")
+    marks.write_text(text.replace("?", "RightLateral"))
+    _, problems = left_out(spoiled, work)
+    assert list(problems) == [("Speaker01", "i")]
+    assert "exchanged" in problems["Speaker01", "i"] and "RightLateral" in problems["Speaker01", "i"]
+
+
+def test_without_the_palate_scan_a_speaker_is_left_out_and_the_others_are_not(spoiled, work):
+    dataset = load_dataset(spoiled)
+    dataset.scans["Speaker01", dataset.palate_phone["Speaker01"]].path.unlink()
+    index, problems = left_out(spoiled, work)
+    assert set(problems) == {("Speaker01", dataset.palate_phone["Speaker01"]), ("Speaker01", None)}
+    assert index.dataset.speakers == ("Speaker02",)
+    assert assembled(work, index).model.speaker.names == ("Speaker02",)
+
+
+def test_a_mesh_with_faces_turned_over_is_no_part_of_the_model_and_shown_first(phantom, work, tmp_path):
+    index, _ = built(load_dataset(phantom), NO_ROUNDS, work)
+    cell = "Speaker02", "i"
+    cache, key = Cache(work), index.tongues[cell][-1]
+    whole = cache.load(key)
+    cache.store(key, {**whole, "flipped": np.array(500)})  # as if the matching had found so
+    try:
+        index, _ = built(load_dataset(phantom), NO_ROUNDS, work)
+        result = assembled(work, index)
+    finally:
+        cache.store(key, whole)
+    (problem,) = index.dataset.problems
+    assert (problem.speaker, problem.phone) == cell and "Speaker02 [i]" in problem.sentence
+    assert not result.scans[cell].used and result.shapes.filled == (cell,)
+    assert (result.suspicious_first()[0].speaker, result.suspicious_first()[0].phone) == cell
+
+
+def test_a_phone_that_nobody_is_left_to_hold_is_not_in_the_model(spoiled, work):
+    for speaker in ("Speaker01", "Speaker02"):
+        (spoiled.parent / "landmarks" / f"{speaker}_i.csv").write_text("name,x_mm,y_mm,z_mm\n")
+    index, problems = left_out(spoiled, work)
+    assert set(problems) == {("Speaker01", "i"), ("Speaker02", "i"), ("", "i")}
+    assert assembled(work, index).model.pose.names == ("a", "ɑ")
+
+
+def test_a_data_set_of_which_nothing_is_left_is_an_error_that_says_why(spoiled, work):
+    for marks in (spoiled.parent / "landmarks").glob("*.csv"):
+        marks.write_text("name,x_mm,y_mm,z_mm\n")
+    with pytest.raises(InputError, match="no scan is left.*landmark"):
+        built(load_dataset(spoiled), NO_ROUNDS, work)
+
+
+# The index ------------------------------------------------------------------------------------------
+
+
+def test_the_index_is_read_back_as_it_was(phantom, work, tmp_path):
+    index = read_index(work)
+    write_index(tmp_path, index)
+    again = read_index(tmp_path)
+    assert (tmp_path / "results.json").read_bytes() == (work / "results.json").read_bytes()
+    assert again.tongues == index.tongues and again.settings == QUICK
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda table: "not JSON",
+        lambda table: "[]",
+        lambda table: json.dumps({**table, "format": "another"}),
+        lambda table: json.dumps({**table, "scans": [{**table["scans"][0], "cloud": "../../etc/passwd"}]}),
+        lambda table: json.dumps({**table, "settings": {"rounds": -1}}),
+        lambda table: json.dumps({**table, "speakers": [1]}),
+        lambda table: json.dumps({name: part for name, part in table.items() if name != "palates"}),
+    ],
+)
+def test_an_index_that_is_none_is_refused_in_a_sentence(work, tmp_path, spoil):
+    table = json.loads((work / "results.json").read_bytes())
+    (tmp_path / "results.json").write_text(spoil(table))
+    with pytest.raises(InputError, match=r"results\.json"):
+        load_result(tmp_path)
+
+
+def test_an_index_whose_results_are_gone_is_refused(work, tmp_path):
+    (tmp_path / "results.json").write_bytes((work / "results.json").read_bytes())
+    with pytest.raises(InputError, match="absent or damaged"):
+        load_result(tmp_path)
+
+
+# The command ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def listed(phantom, tmp_path) -> Path:
+    """The data set's file elsewhere, with the settings of the tests in it."""
+    text = phantom.read_text(encoding="utf-8")
+    for folder in ("scans", "landmarks"):
+        text = text.replace(f'"{folder}/', f'"{(phantom.parent / folder).as_posix()}/')
+    path = tmp_path / "listed.toml"
+    path.write_text(
+        text.replace("[[speakers]]", "[settings]\nrounds = 1\n\n[[speakers]]", 1), encoding="utf-8"
+    )
+    return path
+
+
+def test_the_command_writes_a_model_and_what_it_consists_of(listed, work, tmp_path, capsys):
+    exported = tmp_path / "out"
+    command = ["mri", "build", str(listed), "-o", str(tmp_path / "m.npz"), "--work", str(work), "--jobs", "1"]
+    assert main([*command, "--speaker-modes", "1", "--export", str(exported)]) == 0
+    assert "2 speakers x 3 phones" in capsys.readouterr().err
+    model = load_model(tmp_path / "m.npz")
+    assert model.name == "m" and (model.speaker.size, model.pose.size) == (1, 3)
+    assert "synthetic" in model.provenance["data"] and str(tmp_path) not in str(model.provenance)
+    result = load_result(work)
+    scan = result.scans["Speaker01", "ɑ"]
+    mesh = read_mesh(exported / "Speaker01_back-a.tongue.ply")
+    np.testing.assert_allclose(mesh.vertices, scan.final, atol=1e-4)
+    np.testing.assert_allclose(
+        read_cloud(exported / "Speaker01_back-a.points.ply").points,
+        stored_cloud(work, scan).points,
+        atol=1e-4,
+    )
+    samples = read_sample_database(exported / "samples.yaml")
+    assert samples.speakers == ("Speaker01", "Speaker02") and samples.prompts == ("i", "a", "ɑ")
+    head = read_mesh(samples.paths["Speaker01"]["ɑ"])
+    np.testing.assert_allclose(head.vertices, scan.motion.apply(scan.final), atol=1e-4)
+
+
+def test_the_exit_code_says_that_something_was_left_out(spoiled, work, tmp_path, capsys):
+    (spoiled.parent / "scans" / "Speaker02_i.nii.gz").write_bytes(b"nothing")
+    fewer = tmp_path / "fewer.toml"
+    fewer.write_text("rounds = 0\n")
+    command = [
+        "mri",
+        "build",
+        str(spoiled),
+        "-o",
+        str(tmp_path / "m.npz"),
+        "--work",
+        str(work),
+        "--jobs",
+        "1",
+    ]
+    assert main([*command, "--settings", str(fewer)]) == 3
+    said = capsys.readouterr().err
+    assert "left out: Speaker02 [i]" in said and "Speaker02_i.nii.gz" in said
+    assert load_model(tmp_path / "m.npz").provenance["filled"] == "Speaker02 i"
+
+
+def test_stopping_after_a_stage_leaves_what_it_made(listed, work, tmp_path):
+    exported = tmp_path / "out"
+    command = ["mri", "build", str(listed), "--work", str(work), "--jobs", "1", "--until", "clouds"]
+    assert main([*command, "--export", str(exported)]) == 0
+    kinds = {path.name.split(".", 1)[1] for path in exported.iterdir()}
+    assert kinds == {"points.ply", "palate.ply"}
+
+
+@pytest.mark.parametrize(
+    "flags, said",
+    [
+        ([], "name the model"),
+        (["-o", "model.txt"], "model.txt"),
+        (["-o", "m.npz", "--until", "clouds"], "before there is a model"),
+        (["-o", "m.npz", "--settings", "absent.toml"], "absent.toml"),
+        (["-o", "m.npz", "--speaker-modes", "0"], "speaker_modes"),
+        (["-o", "m.npz", "--jobs", "0"], "0 jobs"),
+    ],
+)
+def test_flags_that_make_no_sense_are_refused_before_anything_is_done(
+    phantom, tmp_path, monkeypatch, capsys, flags, said
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(["mri", "build", str(phantom), *flags]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "m.npz").exists()
+
+
+def test_a_build_that_was_killed_goes_on_where_it_was(listed, tmp_path):
+    """kill -9 in the middle of the scans: what was made by then is whole, and is not made again."""
+    work = tmp_path / "work"
+    program = "import sys; from tonguetrack.tracker.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", program, "mri", "build", str(listed), "--work", str(work), "--jobs", "1",
+               "--until", "scans"]  # fmt: skip
+    with subprocess.Popen(command) as child:
+        end = time.monotonic() + 120.0
+        while len(list(work.glob("cache/*/*.npz"))) < 2:
+            assert child.poll() is None and time.monotonic() < end
+            time.sleep(0.02)
+        child.send_signal(signal.SIGKILL)
+    kept = set(work.glob("cache/*/*.npz"))
+    assert 2 <= len(kept) < 6
+    _, taken = built(load_dataset(listed), QUICK, work, until="scans")
+    assert taken == ["surface"] * (6 - len(kept))

@@ -68,7 +68,7 @@ class BuildSettings:
     denoise: bool = True
     restore_contact: bool = True
     rounds: int = 5
-    completion: str = COMPLETIONS[0]
+    completion: str = "low rank"
     denoising: DenoisingSettings = field(default_factory=DenoisingSettings)
     palate: MatchSettings = PALATE
     palate_prior: PalatePriorSettings = field(default_factory=PalatePriorSettings)
@@ -102,7 +102,8 @@ _SECTIONS = {
 _ABOUT = {
     "denoise": _About("whether scans are denoised"),
     "restore_contact": _About("whether the palate is put in where the tongue touches it"),
-    "rounds": _About("of bootstrapping; 0 for none (paper: 5 for tongues, 1 for palates)", 0, 100),
+    "rounds": _About("of bootstrapping; 0 for none (paper: 5)", 0, 100),
+    "palate_prior.rounds": _About("of bootstrapping; 0 for none (paper: 1)", 0, 100),
     "completion": _About(f"of missing cells: {' or '.join(COMPLETIONS)} (paper: averaging)"),
     "denoising.steps": _About("diffusion steps", 0, 10_000),
     "denoising.step_mm2": _About("time of each, mm^2", 1e-6, 100.0),
@@ -127,8 +128,12 @@ _ABOUT = {
     "tongue.least_landmarks": _About("the same, last energy (paper: 0)"),
     "palate.least_landmarks": _About("the same, last energy (paper: 10)"),
     "energies": _About("in the series, each with new neighbours (paper: 40)", 1, 1000),
-    "radius_mm": _About("how far away a neighbour may be (paper: 4)", 1e-3, 1000.0),
-    "angle_deg": _About("how far its normal may be turned away (paper: 60)", 1e-3, 180.0),
+    "rule.radius_mm": _About("how far away a neighbour may be, first energy (paper: 4)", 1e-3, 1000.0),
+    "rule.angle_deg": _About("how far its normal may be turned away (paper: 60)", 1e-3, 180.0),
+    "last_rule.radius_mm": _About("how far away a neighbour may be, last energy (paper: 4)", 1e-3, 1000.0),
+    "last_rule.angle_deg": _About("how far its normal may be turned away (paper: 60)", 1e-3, 180.0),
+    "seen.radius_mm": _About("how near a point has to be that shows the palate", 1e-3, 1000.0),
+    "seen.angle_deg": _About("how far its normal may be turned away", 1e-3, 180.0),
     "smooth_afterwards": _About(
         "whether motions are averaged with their neighbours' at the end (paper: true)"
     ),
