@@ -65,7 +65,7 @@ def run_match(args: argparse.Namespace) -> int:
     template = template_named(args.template)
     landmarks = read_landmarks(Path(args.landmarks))
     start = _start(args, template, landmarks)
-    cloud = _cloud(args.source)
+    cloud = _cloud(args.source, template, landmarks)
     try:
         settings = TONGUE if args.template == "tongue" else PALATE
         found = match(start, template, SurfaceIndex(cloud), landmarks, settings)
@@ -101,15 +101,19 @@ def _start(args: argparse.Namespace, template: Template, landmarks: Landmarks) -
     return mesh.vertices
 
 
-def _cloud(source: str) -> Cloud:
-    """The points of a file of them, or of the surface in a scan."""
+def _cloud(source: str, template: Template, landmarks: Landmarks) -> Cloud:
+    """The points of a file of them, or of the surface in a scan, for the palate with a threshold of its own."""
     if source.lower().endswith(CLOUD_SUFFIX):
         from ...model.mri.cloudfile import read_cloud
 
         return read_cloud(source)
     from ...model.mri.diffusion import denoise
+    from ...model.mri.palates import palate_surface
     from ...model.mri.scan import read_scan
     from ...model.mri.surface import surface_points
 
     scan = read_scan(source).quantised()
-    return surface_points(scan.holding(denoise(scan.values, scan.spacing_mm)))
+    smooth = scan.holding(denoise(scan.values, scan.spacing_mm))
+    return (
+        palate_surface(smooth, landmarks, template) if template.name == "palate" else surface_points(smooth)
+    )
