@@ -104,6 +104,14 @@ DOCS = {
     ".venv/bin/tonguetrack mri segment smooth.nii.gz -o tissue.nii.gz": HERE,
     ".venv/bin/tonguetrack mri cloud smooth.nii.gz -o surface.ply": HERE,
     ".venv/bin/tonguetrack mri slice smooth.nii.gz -o slice.png --at 2.2 --cloud surface.ply": HERE,
+    (
+        ".venv/bin/tonguetrack mri match heads/scans/Speaker01_a.nii.gz --template tongue "
+        "--landmarks heads/landmarks/Speaker01_a.csv -o tongue-a.ply"
+    ): HERE,
+    (
+        ".venv/bin/tonguetrack mri match heads/scans/Speaker01_a.nii.gz --template palate "
+        "--landmarks heads/landmarks/Speaker01_palate.csv -o palate.ply"
+    ): HERE,
     ".venv/bin/tonguetrack mri preference make model.work -o test --partitions 2": BY_PREFERENCE,
     ".venv/bin/tonguetrack mri preference serve test": BY_PREFERENCE,
     ".venv/bin/tonguetrack mri preference tally test -o tally": BY_PREFERENCE,
@@ -250,6 +258,7 @@ def test_the_flags_that_pages_name_exist():
         "mri segment",
         "mri cloud",
         "mri slice",
+        "mri match",
         "mri preference make",
         "mri preference serve",
         "mri preference tally",
