@@ -204,7 +204,8 @@ class _PlainSurface:
         """(V, 3) mm the neighbour of each vertex, (V,) whether it has a valid one."""
         count = min(CANDIDATES, len(self._cloud.points))
         distances, indices = self._tree.query(shape, k=count, distance_upper_bound=NEIGHBOUR_MM)
-        distances, indices = distances.reshape(len(shape), -1), indices.reshape(len(shape), -1)
+        distances = np.asarray(distances).reshape(len(shape), -1)
+        indices = np.asarray(indices).reshape(len(shape), -1)
         valid = np.isfinite(distances)
         indices = np.where(valid, indices, 0)
         normals = self._cloud.normals
