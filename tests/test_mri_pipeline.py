@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,11 +27,20 @@ from tonguetrack.model.mri.phantom.surfaces import BURIED
 from tonguetrack.model.mri.phantom.truth import read_truth
 from tonguetrack.model.mri.pipeline import build
 from tonguetrack.model.mri.results import assembled, load_result, read_index, stored_cloud, write_index
-from tonguetrack.model.mri.settings import BuildSettings
+from tonguetrack.model.mri.settings import BuildSettings, settings_toml
 from tonguetrack.parallel import local
 from tonguetrack.tracker.cli import main
 
-QUICK = replace(BuildSettings(), rounds=1)
+USUAL = BuildSettings()
+QUICK = replace(
+    USUAL,
+    rounds=1,
+    denoising=replace(USUAL.denoising, steps=8),
+    palate=replace(USUAL.palate, energies=12),
+    tongue=replace(USUAL.tongue, energies=12),
+    tongue_prior=replace(USUAL.tongue_prior, energies=4),
+)
+NO_ROUNDS = replace(QUICK, rounds=0)
 
 
 @pytest.fixture(scope="session")
@@ -206,9 +213,6 @@ def spoiled(phantom, tmp_path) -> Path:
     return copied(phantom, tmp_path / "set")
 
 
-NO_ROUNDS = replace(QUICK, rounds=0)
-
-
 def left_out(path, work):
     index, _ = built(load_dataset(path), NO_ROUNDS, work)
     return index, {(problem.speaker, problem.phone): problem.sentence for problem in index.dataset.problems}
@@ -333,7 +337,7 @@ def test_an_index_whose_results_are_gone_is_refused(work, tmp_path):
 
 @pytest.fixture
 def listed(phantom, tmp_path) -> Path:
-    """The data set's file elsewhere, with the settings of the tests in it."""
+    """The data set's file elsewhere."""
     text = phantom.read_text(encoding="utf-8")
     for folder in ("scans", "landmarks"):
         text = text.replace(f'"{folder}/', f'"{(phantom.parent / folder).as_posix()}/')
@@ -344,9 +348,17 @@ def listed(phantom, tmp_path) -> Path:
     return path
 
 
-def test_the_command_writes_a_model_and_what_it_consists_of(listed, work, tmp_path, capsys):
+@pytest.fixture
+def options(work, tmp_path) -> list[str]:
+    """The work folder and the settings of the tests, for the command."""
+    path = tmp_path / "quick.toml"
+    path.write_text(settings_toml(QUICK), encoding="utf-8")
+    return ["--work", str(work), "--settings", str(path), "--jobs", "1"]
+
+
+def test_the_command_writes_a_model_and_what_it_consists_of(listed, work, options, tmp_path, capsys):
     exported = tmp_path / "out"
-    command = ["mri", "build", str(listed), "-o", str(tmp_path / "m.npz"), "--work", str(work), "--jobs", "1"]
+    command = ["mri", "build", str(listed), "-o", str(tmp_path / "m.npz"), *options]
     assert main([*command, "--speaker-modes", "1", "--export", str(exported)]) == 0
     assert "2 speakers x 3 phones" in capsys.readouterr().err
     model = load_model(tmp_path / "m.npz")
@@ -367,7 +379,7 @@ def test_the_command_writes_a_model_and_what_it_consists_of(listed, work, tmp_pa
     np.testing.assert_allclose(head.vertices, scan.motion.apply(scan.final), atol=1e-4)
 
 
-def test_the_exit_code_says_that_something_was_left_out(spoiled, work, tmp_path, capsys):
+def test_the_exit_code_says_that_something_was_left_out(spoiled, options, tmp_path, capsys):
     (spoiled.parent / "scans" / "Speaker02_i.nii.gz").write_bytes(b"nothing")
     fewer = tmp_path / "fewer.toml"
     fewer.write_text("rounds = 0\n")
@@ -388,10 +400,9 @@ def test_the_exit_code_says_that_something_was_left_out(spoiled, work, tmp_path,
     assert load_model(tmp_path / "m.npz").provenance["filled"] == "Speaker02 i"
 
 
-def test_stopping_after_a_stage_leaves_what_it_made(listed, work, tmp_path):
+def test_stopping_after_a_stage_leaves_what_it_made(listed, options, tmp_path):
     exported = tmp_path / "out"
-    command = ["mri", "build", str(listed), "--work", str(work), "--jobs", "1", "--until", "clouds"]
-    assert main([*command, "--export", str(exported)]) == 0
+    assert main(["mri", "build", str(listed), *options, "--until", "clouds", "--export", str(exported)]) == 0
     kinds = {path.name.split(".", 1)[1] for path in exported.iterdir()}
     assert kinds == {"points.ply", "palate.ply"}
 
@@ -416,12 +427,12 @@ def test_flags_that_make_no_sense_are_refused_before_anything_is_done(
     assert not (tmp_path / "m.npz").exists()
 
 
-def test_a_build_that_was_killed_goes_on_where_it_was(listed, tmp_path):
+def test_a_build_that_was_killed_goes_on_where_it_was(listed, options, tmp_path):
     """kill -9 in the middle of the scans: what was made by then is whole, and is not made again."""
     work = tmp_path / "work"
     program = "import sys; from tonguetrack.tracker.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", program, "mri", "build", str(listed), "--work", str(work), "--jobs", "1",
-               "--until", "scans"]  # fmt: skip
+    command = [sys.executable, "-c", program, "mri", "build", str(listed), "--until", "scans", *options]
+    command[command.index("--work") + 1] = str(work)
     with subprocess.Popen(command) as child:
         end = time.monotonic() + 120.0
         while len(list(work.glob("cache/*/*.npz"))) < 2:

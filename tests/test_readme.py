@@ -100,6 +100,9 @@ DOCS = {
     ".venv/bin/tonguetrack doctor": ELSEWHERE + "test_doctor.py, where what is found may be anything",
     ".venv/bin/tonguetrack devices": HERE,
     HEADS: HERE,
+    ".venv/bin/tonguetrack mri build heads/dataset.toml -o heads.npz --report report": ELSEWHERE
+    + "test_mri_pipeline.py, with another set",
+    ".venv/bin/tonguetrack mri build --print-settings": HERE,
     ".venv/bin/tonguetrack mri denoise heads/scans/Speaker01_a.nii.gz -o smooth.nii.gz": HERE,
     ".venv/bin/tonguetrack mri segment smooth.nii.gz -o tissue.nii.gz": HERE,
     ".venv/bin/tonguetrack mri cloud smooth.nii.gz -o surface.ply": HERE,
