@@ -381,20 +381,8 @@ def test_the_command_writes_a_model_and_what_it_consists_of(listed, work, option
 
 def test_the_exit_code_says_that_something_was_left_out(spoiled, options, tmp_path, capsys):
     (spoiled.parent / "scans" / "Speaker02_i.nii.gz").write_bytes(b"nothing")
-    fewer = tmp_path / "fewer.toml"
-    fewer.write_text("rounds = 0\n")
-    command = [
-        "mri",
-        "build",
-        str(spoiled),
-        "-o",
-        str(tmp_path / "m.npz"),
-        "--work",
-        str(work),
-        "--jobs",
-        "1",
-    ]
-    assert main([*command, "--settings", str(fewer)]) == 3
+    Path(options[options.index("--settings") + 1]).write_text(settings_toml(NO_ROUNDS), encoding="utf-8")
+    assert main(["mri", "build", str(spoiled), "-o", str(tmp_path / "m.npz"), *options]) == 3
     said = capsys.readouterr().err
     assert "left out: Speaker02 [i]" in said and "Speaker02_i.nii.gz" in said
     assert load_model(tmp_path / "m.npz").provenance["filled"] == "Speaker02 i"
