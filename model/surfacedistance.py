@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .mesh import FloatArray, IndexArray, Mesh
 
-LEAF = 4  # faces in a box that is not divided any more, at most
+LEAF = 16  # faces in a box that is not divided any more, at most
 FLAT = 1e-12  # a triangle with less of its sides' product as area, squared, is a line
 
 

@@ -9,9 +9,11 @@ any scan; what is found there tells of the prior, not of the extraction, so that
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,9 +82,11 @@ class Row:
 
 @dataclass(frozen=True)
 class TruthComparison:
-    """scans: (speaker, phone) -> its tongue; palates: speaker -> mean distance in mm from the true palate to the
-    extracted one, in the scan that it was extracted from; problems: what could not be compared, and why."""
+    """files: (speaker, phone) -> where its truth is; scans: the same -> its tongue against that; palates: speaker -> mean
+    distance in mm from the true palate to the extracted one, in the scan that it was extracted from; problems: what
+    could not be compared, and why."""
 
+    files: Mapping[Cell, Path]
     scans: Mapping[Cell, ScanComparison]
     palates: Mapping[str, float]
     problems: tuple[Problem, ...] = ()
@@ -130,21 +134,25 @@ def compare(
     result: BuildResult, dataset: Dataset, executor: Executor, progress: Progress | None = None
 ) -> TruthComparison:
     """Every scan that has a tongue, against its truth; those without a readable truth are named in `problems`."""
-    cases = [
-        _Case(dataset, scan, result.scans.get((scan.speaker, dataset.palate_phone.get(scan.speaker, ""))))
-        for scan in result.scans.values()
-    ]
+    cases = {}
+    for cell, scan in result.scans.items():
+        own = result.scans.get((scan.speaker, dataset.palate_phone.get(scan.speaker, "")))
+        own_truth = None if own is None else truth_path(dataset, own.speaker, own.phone)
+        cases[cell] = _Case(scan, truth_path(dataset, *cell), own, own_truth)
     work = partial(_compared, result.tongue.mesh.faces, result.palate.mesh.faces)
-    scans, palates, problems = {}, {}, []
-    for case, outcome in zip(cases, executor.run(work, cases, progress), strict=True):
-        speaker, phone = case.scan.speaker, case.scan.phone
+    files, scans, palates, problems = {}, {}, {}, []
+    for (cell, case), outcome in zip(
+        cases.items(), executor.run(work, list(cases.values()), progress), strict=True
+    ):
+        speaker, phone = cell
         if isinstance(outcome, Failed):
             problems.append(Problem(speaker, phone, f"{speaker} [{phone}]: {outcome.reason}"))
             continue
-        scans[speaker, phone], palate_mm = outcome
+        files[cell] = case.truth
+        scans[cell], palate_mm = outcome
         if case.own is case.scan:
             palates[speaker] = palate_mm
-    return TruthComparison(scans, palates, tuple(problems))
+    return TruthComparison(files, scans, palates, tuple(problems))
 
 
 def surface_error(
@@ -198,25 +206,54 @@ def ablations(base: BuildSettings) -> list[Ablation]:
     ]
 
 
+def text_table(comparison: TruthComparison) -> str:
+    """The rows, for a terminal."""
+    lines = [f"{'against the truth':38}{'first':>8}{'last':>8}{'worst':>8}"]
+    for row in comparison.rows():
+        numbers = "".join(
+            " " * 8 if math.isnan(value) else f"{value:8.2f}" for value in (row.initial, row.final, row.worst)
+        )
+        aim = "" if row.most is None else f"  (aim: {row.most:g})"
+        lines.append(f"{row.name:38}{numbers} {row.unit}{aim}")
+    return "\n".join(lines)
+
+
+def ablation_table(found: Mapping[str, TruthComparison]) -> str:
+    """A line for each build, for a terminal: mm, or degrees where it says so."""
+    shown = ("first", "last", "contact", "place", "turn")
+    lines = [f"{'mm to the true tongue, and palate':38}" + "".join(f"{name:>9}" for name in shown)]
+    for name, comparison in found.items():
+        lines.append(f"{name:38}" + "".join(f"{value:9.2f}" for value in in_short(comparison)))
+    return "\n".join(lines)
+
+
+def in_short(comparison: TruthComparison) -> tuple[float, float, float, float, float]:
+    """The tongue before and after bootstrapping, in contact, mm; the palate's place, mm, and turn, degrees."""
+    tongue, _, _, contact, _, _, _, place, turn, _ = comparison.rows()
+    return tongue.initial, tongue.final, contact.final, place.final, turn.final
+
+
 # One scan ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Case:
-    """own: the scan of the same speaker that the palate was extracted from, None where it was lost."""
+    """truth: its file. own: the scan of the same speaker that the palate was extracted from, None where it was lost, and
+    its truth's file."""
 
-    dataset: Dataset
     scan: ScanResult
+    truth: Path
     own: ScanResult | None
+    own_truth: Path | None
 
 
 def _compared(tongue: IndexArray, palate: IndexArray, case: _Case) -> tuple[ScanComparison, float]:
     """And the palate's own error there."""
     scan, own = case.scan, case.own
-    truth = read_truth(truth_path(case.dataset, scan.speaker, scan.phone))
+    truth = read_truth(case.truth)
     motion = (float("nan"), float("nan"))
-    if own is not None and own is not scan:
-        before = read_truth(truth_path(case.dataset, own.speaker, own.phone)).head_to_world
+    if own is not None and case.own_truth is not None and case.own_truth != case.truth:
+        before = read_truth(case.own_truth).head_to_world
         motion = motion_error(own.palate, scan.palate, truth.head_to_world @ np.linalg.inv(before))
     apart = nearest_on(Mesh(scan.palate, palate), truth.palate.vertices).distance_mm
     compared = ScanComparison(
