@@ -44,9 +44,14 @@ class DenoisingSettings:
 
 @dataclass(frozen=True)
 class TonguePriorSettings:
-    """The fit of the multilinear model in a round. speaker_modes, pose_modes: so many weights, at most."""
+    """The fit of the multilinear model in a round. speaker_modes, pose_modes: so many weights, at most.
 
-    h: float = 0.5
+    h: the paper's box of 0.5 sigma, sigma being what the authors' software takes for it, holds a phone's weights away from
+    where that phone is: on phantoms a round then ends 0.02 mm farther from the truth than it began (where the palate is
+    touched 0.5 mm), with 2 sigma 0.08 (0.12) mm nearer.
+    """
+
+    h: float = 2.0
     energies: int = 10
     speaker_modes: int = 10
     pose_modes: int = 12
