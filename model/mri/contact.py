@@ -45,7 +45,8 @@ def restore_contact(cloud: Cloud, palate: Mesh, settings: ContactSettings | None
     if cloud.normals is None:
         raise InputError("the point cloud has no normals; without them, nothing tells tongue from palate.")
     places, normals, edge = _samples(palate)
-    apart_mm, nearest = cKDTree(places).query(cloud.points)
+    found = cKDTree(places).query(cloud.points)
+    apart_mm, nearest = np.asarray(found[0]), np.asarray(found[1])
     if apart_mm.min() > NEAR_MM:
         raise InputError(
             f"the point cloud is {apart_mm.min():.0f} mm away from the palate; bring the palate into its scan first."

@@ -166,7 +166,7 @@ class _Values:
         volume = gaussian_filter(
             scan.values.astype(np.float32), smoothing_mm / scan.spacing_mm, mode="nearest", truncate=3.0
         )
-        matrix = np.linalg.inv(scan.to_world[:3, :3])
+        matrix = np.asarray(np.linalg.inv(scan.to_world[:3, :3]), dtype=np.float64)
         return cls(np.ascontiguousarray(volume), matrix, -matrix @ scan.to_world[:3, 3])
 
 
@@ -216,7 +216,8 @@ class _Search:
         score, gradient, matrix, _ = self._compared(self._there, motion)
         damping = FIRST_DAMPING
         for _ in range(STEPS):
-            step = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
+            damped = matrix + damping * np.diag(np.diag(matrix))
+            step = np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64)
             further = _stepped(motion, self._profiles.pivot, step)
             there = self._compared(self._there, further)
             if there[0] > score:
