@@ -115,6 +115,17 @@ DOCS = {
         ".venv/bin/tonguetrack mri match heads/scans/Speaker01_a.nii.gz --template palate "
         "--landmarks heads/landmarks/Speaker01_palate.csv -o palate.ply"
     ): HERE,
+    (
+        ".venv/bin/tonguetrack mri align palate.ply --from heads/scans/Speaker01_a.nii.gz "
+        "--to heads/scans/Speaker01_i.nii.gz -o palate-i.ply"
+    ): HERE,
+    ".venv/bin/tonguetrack mri denoise heads/scans/Speaker01_i.nii.gz -o smooth-i.nii.gz": HERE,
+    ".venv/bin/tonguetrack mri cloud smooth-i.nii.gz -o surface-i.ply": HERE,
+    ".venv/bin/tonguetrack mri restore surface-i.ply --palate palate-i.ply -o restored-i.ply": HERE,
+    (
+        ".venv/bin/tonguetrack mri match restored-i.ply --template tongue "
+        "--landmarks heads/landmarks/Speaker01_i.csv -o tongue-i.ply"
+    ): HERE,
     ".venv/bin/tonguetrack mri preference make model.work -o test --partitions 2": BY_PREFERENCE,
     ".venv/bin/tonguetrack mri preference serve test": BY_PREFERENCE,
     ".venv/bin/tonguetrack mri preference tally test -o tally": BY_PREFERENCE,
@@ -262,6 +273,8 @@ def test_the_flags_that_pages_name_exist():
         "mri cloud",
         "mri slice",
         "mri match",
+        "mri align",
+        "mri restore",
         "mri preference make",
         "mri preference serve",
         "mri preference tally",
