@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from ...model.mri.dataset import Dataset
     from ...model.mri.results import BuildResult, Index
     from ...model.mri.settings import BuildSettings
+    from ...model.mri.truthcomparison import TruthComparison
+    from ...parallel import Executor
 
 STAGES = ("scans", "palates", "aligned", "clouds", "matched", "tongues")
 SUSPICIOUS = 5  # scans that are named in the end, at most; the report has all
@@ -69,6 +71,8 @@ def add_verbs(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> Non
 
 def run_build(args: argparse.Namespace) -> int:
     from ... import InputError
+    from ...model.mri.exporting import export
+    from ...model.mri.pipeline import build
     from ...model.mri.settings import settings_toml
 
     dataset, settings = _input(args)
@@ -86,14 +90,14 @@ def run_build(args: argparse.Namespace) -> int:
         )
     if not whole and (args.report is not None or args.ablations):
         raise InputError(f"--until {args.until} ends before there is anything to report.")
-    work = _prepared(args)
-    index = _built(args, dataset, settings, work)
-    if args.export is not None:
-        from ...model.mri.exporting import export
-
-        export(work, index, args.export)
-    if whole:
-        _finish(args, index, work)
+    work = _prepared(args, dataset)
+    with workers(args) as executor:
+        index = build(dataset, settings, work, executor, bar, args.until)
+        if args.export is not None:
+            export(work, index, args.export)
+        if whole:
+            result = _written(args, index, work)
+            _report(args, result, index, work, executor)
     for problem in index.dataset.problems:
         print(f"left out: {problem.sentence}", file=sys.stderr)
     return EXIT_LEFT_OUT if index.dataset.problems else 0
@@ -115,9 +119,12 @@ def _input(args: argparse.Namespace) -> tuple[Dataset | None, BuildSettings]:
     return dataset, settings_of({"model": given}, "the command line", settings)
 
 
-def _prepared(args: argparse.Namespace) -> Path:
-    """The work folder; looks at every place that is going to be written, before the work is done."""
+def _prepared(args: argparse.Namespace, dataset: Dataset) -> Path:
+    """The work folder; looks at all that will be needed and written, before the work is done."""
+    from ... import InputError
     from ...model.files import check_model_suffix
+    from ...model.mri.qualityreport import require_drawing
+    from ...model.mri.truthcomparison import has_truth
     from .names import keep_apart, prepare_folder
 
     read = [Path(name) for name in (args.dataset, args.settings) if name is not None]
@@ -127,21 +134,20 @@ def _prepared(args: argparse.Namespace) -> Path:
         prepare_folder(named)
         keep_apart([named], read)
     work = named.with_suffix(".work") if args.work is None else Path(args.work)
+    if args.report is not None:
+        require_drawing()
+    if args.ablations and not has_truth(dataset):
+        raise InputError(
+            f"{args.dataset}: ablations are judged by the truth, which only the data set of 'tonguetrack mri phantom' has."
+        )
     for folder in (work, args.report, args.export):
         if folder is not None:
             prepare_folder(Path(folder) / "any")
     return work
 
 
-def _built(args: argparse.Namespace, dataset: Dataset, settings: BuildSettings, work: Path) -> Index:
-    from ...model.mri.pipeline import build
-
-    with workers(args) as executor:
-        return build(dataset, settings, work, executor, bar, args.until)
-
-
-def _finish(args: argparse.Namespace, index: Index, work: Path) -> None:
-    """Writes the index of the work folder and the model; says what was found."""
+def _written(args: argparse.Namespace, index: Index, work: Path) -> BuildResult:
+    """The result, after its index and the model are written; says what was found."""
     from dataclasses import replace
 
     from ...model.files import save_model
@@ -151,12 +157,51 @@ def _finish(args: argparse.Namespace, index: Index, work: Path) -> None:
     write_index(work, index)
     result = assembled(work, index)
     name = args.name or as_text(Path(args.output).stem)
-    model = replace(result.model, provenance={"name": name, **result.model.provenance})
-    save_model(model, args.output)
+    save_model(replace(result.model, provenance={"name": name, **result.model.provenance}), args.output)
     print(f"{args.output}: {_described(result)}", file=sys.stderr)
     for scan in result.suspicious_first()[:SUSPICIOUS]:
         if scan.suspicion > 0.0:
             print(f"look at {scan.speaker} [{scan.phone}]: {' '.join(scan.notes)}", file=sys.stderr)
+    return result
+
+
+def _report(
+    args: argparse.Namespace, result: BuildResult, index: Index, work: Path, executor: Executor
+) -> None:
+    """What --report and --ablations ask for. Compared with the truth where there is one."""
+    from ...model.mri.truthcomparison import ablation_table, compare, has_truth, text_table
+
+    if args.report is None and not args.ablations:
+        return
+    comparison, others = None, {}
+    if has_truth(index.dataset):
+        with bar("compared with the truth") as progress:
+            comparison = compare(result, index.dataset, executor, progress)
+        print(text_table(comparison))
+    if args.ablations:
+        others = _ablations(index, work, executor)
+        print(ablation_table(others))
+    if args.report is not None:
+        from ...model.mri.qualityreport import write_report
+
+        with bar("pictures for the report") as progress:
+            page = write_report(args.report, result, executor, comparison, others, progress)
+        print(f"{page}: scans that look wrong first", file=sys.stderr)
+
+
+def _ablations(index: Index, work: Path, executor: Executor) -> dict[str, TruthComparison]:
+    """What was done differently -> how near the result is to the truth. Shares the work folder with the build."""
+    from ...model.mri.pipeline import build
+    from ...model.mri.results import assembled
+    from ...model.mri.truthcomparison import ablations, compare
+
+    found = {}
+    for other in ablations(index.settings):
+        print(f"{other.name} ...", file=sys.stderr)
+        result = assembled(work, build(index.dataset, other.settings, work, executor, bar))
+        with bar("compared with the truth") as progress:
+            found[other.name] = compare(result, index.dataset, executor, progress)
+    return found
 
 
 def _described(result: BuildResult) -> str:
