@@ -77,7 +77,8 @@ def vertex_areas(mesh: Mesh) -> FloatArray:
     """(n,) mm^2: a third of the faces around each vertex."""
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     thirds = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
-    return np.bincount(mesh.faces.ravel(), np.repeat(thirds, 3), minlength=len(mesh.vertices))
+    counted = np.bincount(mesh.faces.ravel(), np.repeat(thirds, 3), minlength=len(mesh.vertices))
+    return counted.astype(np.float64)
 
 
 def _tree(triangles: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.int64], FloatArray]:

@@ -58,7 +58,7 @@ th { background: #eceef1; } th:first-child, td.name { text-align: left; white-sp
 article { background: #fff; border: 1px solid #dde1e5; border-radius: 6px; margin: 1rem 0; padding: .7rem .9rem;
   scroll-margin-top: 3rem; }
 article.doubtful { border-left: 5px solid #b3202a; } article:target { box-shadow: 0 0 0 3px #19a3ff88; }
-article h3 { font-size: 1rem; margin: 0; display: inline; } article .numbers { color: #3f4952; margin: .15rem 0 .5rem; }
+article h3 { font-size: 1rem; margin: 0; display: inline; } article .numbers { max-width: none; color: #3f4952; margin: .15rem 0 .5rem; }
 .back { float: right; color: #5c6670; }
 .sheet { position: relative; } .sheet img { display: block; width: 100%; }
 .sheet svg { position: absolute; inset: 0; width: 100%; height: 100%; }
@@ -106,8 +106,6 @@ def scan_block(
         f"moved {moved_mm:.2f} mm by bootstrapping",
         f"correlation of the palate's profiles {scan.alignment_score:.2f}",
     ]
-    if scan.flipped:
-        facts.append(f"{scan.flipped} faces turned over")
     lines = [" &middot; ".join(facts)]
     if compared is not None:
         first, last = compared.initial, compared.final
