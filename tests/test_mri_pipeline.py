@@ -25,11 +25,11 @@ from tonguetrack.model.mri.dataset import load_dataset
 from tonguetrack.model.mri.phantom.making import truth_path
 from tonguetrack.model.mri.phantom.surfaces import BURIED
 from tonguetrack.model.mri.phantom.truth import read_truth
-from tonguetrack.model.mri.pipeline import build
+from tonguetrack.model.mri.pipeline import STAGES, build
 from tonguetrack.model.mri.results import assembled, load_result, read_index, stored_cloud, write_index
 from tonguetrack.model.mri.settings import BuildSettings, settings_toml
 from tonguetrack.parallel import local
-from tonguetrack.tracker.cli import main
+from tonguetrack.tracker.cli import main, mribuild
 
 USUAL = BuildSettings()
 QUICK = replace(
@@ -377,6 +377,25 @@ def test_the_command_writes_a_model_and_what_it_consists_of(listed, work, option
     assert samples.speakers == ("Speaker01", "Speaker02") and samples.prompts == ("i", "a", "ɑ")
     head = read_mesh(samples.paths["Speaker01"]["ɑ"])
     np.testing.assert_allclose(head.vertices, scan.motion.apply(scan.final), atol=1e-4)
+
+
+def test_the_commands_stages_are_the_pipelines():
+    assert list(mribuild.STAGES) == list(STAGES)
+
+
+def test_the_command_reports_and_compares_a_phantom_with_its_truth(phantom, options, tmp_path, capsys):
+    report = tmp_path / "report"
+    command = ["mri", "build", str(phantom), "-o", str(tmp_path / "m.npz"), *options]
+    assert main([*command, "--report", str(report)]) == 0
+    said = capsys.readouterr()
+    assert "true tongue to extracted" in said.out and str(report / "index.html") in said.err
+    numbers = json.loads((report / "report.json").read_bytes())
+    assert "Speaker01" in json.dumps(numbers)
+
+
+def test_ablations_need_a_truth(listed, options, tmp_path, capsys):
+    assert main(["mri", "build", str(listed), "-o", str(tmp_path / "m.npz"), *options, "--ablations"]) == 2
+    assert "truth" in capsys.readouterr().err
 
 
 def test_the_exit_code_says_that_something_was_left_out(spoiled, options, tmp_path, capsys):
