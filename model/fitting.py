@@ -24,15 +24,16 @@ one is taken that is nearest to the training speakers and poses, in units of the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import InputError
-from .mesh import FloatArray, vertex_normals
+from .cloud import Cloud
+from .mesh import FloatArray, IndexArray, vertex_normals
 from .multilinear import Mode, TongueModel
+from .neighbours import NeighbourRule, SurfaceIndex
 
 NEIGHBOUR_MM = 4.0
 NEIGHBOUR_DEGREES = 60.0
@@ -47,19 +48,6 @@ FIRST_DAMPING = 1e-4
 LEAST_DAMPING, LARGEST_DAMPING = 1e-12, 1e12
 ROUNDING = 1e-22  # of the squared targets: a lower energy is 0
 LEAST_SPREAD = 1e-3  # of sigma: the least deviation that is taken for measured
-
-
-@dataclass(frozen=True)
-class Cloud:
-    """A surface that is not registered to the model, in the model's frame, mm.
-
-    points: (n, 3); normals: (n, 3) unit, outwards, or None where they are not known; landmarks: vertex of the
-    model -> (3,) where it is.
-    """
-
-    points: FloatArray
-    normals: FloatArray | None = None
-    landmarks: Mapping[int, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -123,48 +111,64 @@ def fit_points(
     return fit_clouds(model, [Cloud(points, normals, landmarks or {})], h, iterations)
 
 
-def fit_clouds(model: TongueModel, clouds: Sequence[Cloud], h: float, iterations: int = SERIES) -> Fit:
+def fit_clouds(
+    model: TongueModel,
+    clouds: Sequence[Cloud],
+    h: float,
+    iterations: int = SERIES,
+    rule: NeighbourRule | None = None,
+    start: Fit | None = None,
+) -> Fit:
     """One speaker and a pose for each cloud, by a series of nearest neighbours and fits to them.
 
     A neighbour is the nearest point within 4 mm whose normal turns at most 60 degrees away from the vertex's (any
     point where the cloud has no normals). There is no rigid alignment: the clouds have to be in the model's frame.
-    The paper prefers candidates below the surface, against the stray points of its volumetric clouds; here the
-    nearest is taken, as a surface has no inside.
+    rule: for the volumetric cloud of a scan, with points of much else: the paper's neighbours, which prefer what lies
+    below the surface (`SurfaceIndex.targets`); the clouds need normals then. Without it the nearest is taken, as a
+    mesh's surface has no inside.
 
-    h: the box in sigma; iterations: fits in the series. Raises InputError where a cloud is empty, is not made of
-    numbers, names a vertex that the model lacks, or is not where the model is.
+    h: the box in sigma; iterations: fits in the series; start: a fit to as many clouds from whose weights the series
+    begins (their mean by default). Raises InputError where a cloud is empty, is not made of numbers, names a vertex
+    that the model lacks, is not where the model is, or lacks the normals that a rule needs.
     """
-    from scipy.spatial import cKDTree
-
     if not clouds or iterations < 1:
         raise InputError("nothing can be fitted: expected at least one cloud and at least one step.")
     for number, cloud in enumerate(clouds, 1):
         _check_cloud(model, cloud, f"cloud {number}")
-    trees = [cKDTree(cloud.points) for cloud in clouds]
+    surfaces = [_PlainSurface(cloud) if rule is None else _RuledSurface(cloud, rule) for cloud in clouds]
     box = _Box.of(model, h, len(clouds))
     found = _Weights(model.speaker.mean, np.tile(model.pose.mean, (len(clouds), 1)))
+    if start is not None:
+        if start.poses.shape != found.poses.shape or start.speaker.shape != found.speaker.shape:
+            raise InputError(
+                f"a fit of {len(start.poses)} meshes by another model cannot be the start for {len(clouds)} clouds."
+            )
+        found = found.like(np.clip(_Weights(start.speaker, start.poses).flat, box.low, box.high))
+    reach_mm = NEIGHBOUR_MM if rule is None else rule.radius_mm
     at_rest, used = False, np.zeros(len(clouds))
     for step in range(iterations):
         reduced = []
-        for index, (shape, cloud, tree) in enumerate(zip(_shapes(model, found), clouds, trees, strict=True)):
-            neighbour, valid = _neighbours(model, shape, cloud, tree)
+        for index, (shape, cloud, surface) in enumerate(
+            zip(_shapes(model, found), clouds, surfaces, strict=True)
+        ):
+            neighbours, valid = surface.targets(shape, model.faces)
             used[index] = valid.mean()
             if used[index] < LEAST_NEIGHBOURS:
                 raise InputError(
                     f"mesh {index + 1}: only {100 * used[index]:.0f} % of the model's vertices have a point of it "
-                    f"within {NEIGHBOUR_MM:g} mm that faces the same way; bring it into the model's frame first, in "
+                    f"within {reach_mm:g} mm that faces the same way; bring it into the model's frame first, in "
                     "mm, x left, y back, z up."
                 )
-            weights, targets = _with_landmarks(cloud, valid, cloud.points[neighbour])
+            weights, targets = _with_landmarks(cloud, valid, neighbours)
             reduced.append(_Gram(model, weights).reduced(targets))
         problem = _problem_of(reduced)
         # The first fit may look for the lowest of several minima; the later ones follow it.
         found, at_rest = _lowest(problem, box) if step == 0 else _descend(problem, box, found)
     residual_mm = np.zeros(len(clouds))
-    for index, (shape, cloud, tree) in enumerate(zip(_shapes(model, found), clouds, trees, strict=True)):
-        neighbour, valid = _neighbours(model, shape, cloud, tree)
+    for index, (shape, surface) in enumerate(zip(_shapes(model, found), surfaces, strict=True)):
+        neighbours, valid = surface.targets(shape, model.faces)
         used[index] = valid.mean()
-        apart = np.linalg.norm(shape - cloud.points[neighbour], axis=1)[valid]
+        apart = np.linalg.norm(shape - neighbours, axis=1)[valid]
         residual_mm[index] = apart.mean() if valid.any() else np.nan
     return _fit(model, problem, box, found, at_rest, residual_mm, used)
 
@@ -188,21 +192,40 @@ def _check_cloud(model: TongueModel, cloud: Cloud, name: str) -> None:
             )
 
 
-def _neighbours(
-    model: TongueModel, shape: FloatArray, cloud: Cloud, tree: Any
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """(V,) the index of each vertex's neighbour, and whether it has a valid one."""
-    count = min(CANDIDATES, len(cloud.points))
-    distances, indices = tree.query(shape, k=count, distance_upper_bound=NEIGHBOUR_MM)
-    distances, indices = distances.reshape(len(shape), -1), indices.reshape(len(shape), -1)
-    valid = np.isfinite(distances)
-    indices = np.where(valid, indices, 0)
-    if cloud.normals is not None:
-        facing = np.einsum("va,vca->vc", vertex_normals(shape, model.faces), cloud.normals[indices])
-        valid &= facing >= np.cos(np.radians(NEIGHBOUR_DEGREES))
-    first = np.argmax(valid, axis=1)
-    rows = np.arange(len(shape))
-    return np.asarray(indices[rows, first], dtype=np.intp), valid[rows, first]
+class _PlainSurface:
+    """The nearest point that faces the same way; any, where the cloud has no normals."""
+
+    def __init__(self, cloud: Cloud) -> None:
+        from scipy.spatial import cKDTree
+
+        self._cloud, self._tree = cloud, cKDTree(cloud.points)
+
+    def targets(self, shape: FloatArray, faces: IndexArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """(V, 3) mm the neighbour of each vertex, (V,) whether it has a valid one."""
+        count = min(CANDIDATES, len(self._cloud.points))
+        distances, indices = self._tree.query(shape, k=count, distance_upper_bound=NEIGHBOUR_MM)
+        distances = np.asarray(distances).reshape(len(shape), -1)
+        indices = np.asarray(indices).reshape(len(shape), -1)
+        valid = np.isfinite(distances)
+        indices = np.where(valid, indices, 0)
+        normals = self._cloud.normals
+        if normals is not None:
+            facing = np.einsum("va,vca->vc", vertex_normals(shape, faces), normals[indices])
+            valid &= facing >= np.cos(np.radians(NEIGHBOUR_DEGREES))
+        first = np.argmax(valid, axis=1)
+        rows = np.arange(len(shape))
+        return self._cloud.points[indices[rows, first]], valid[rows, first]
+
+
+class _RuledSurface:
+    """Where the paper's rule sends each vertex."""
+
+    def __init__(self, cloud: Cloud, rule: NeighbourRule) -> None:
+        self._index, self._rule = SurfaceIndex(cloud), rule
+
+    def targets(self, shape: FloatArray, faces: IndexArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """As `_PlainSurface.targets`."""
+        return self._index.targets(shape, vertex_normals(shape, faces), self._rule)
 
 
 def _with_landmarks(

@@ -93,13 +93,17 @@ def offences(rows: list[str]) -> None:
 
 # Who may import whom --------------------------------------------------------------------------------
 
-ROOT_MODULES = ("tonguetrack", "tonguetrack.atomic", "tonguetrack.archive")
+ROOT_MODULES = ("tonguetrack", "tonguetrack.atomic", "tonguetrack.archive", "tonguetrack.parallel")
 CORE = tuple(
     name
     for name in SOURCES
     if within(name, "tonguetrack.tracker")
     and not within(
-        name, "tonguetrack.tracker.cli", "tonguetrack.tracker.streams", "tonguetrack.tracker.viewer"
+        name,
+        "tonguetrack.tracker.cli",
+        "tonguetrack.tracker.streams",
+        "tonguetrack.tracker.viewer",
+        "tonguetrack.tracker.preferenceserver",
     )
 )
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from tonguetrack.model.fitting import Cloud
+from tonguetrack.model.cloud import Cloud
 from tonguetrack.model.mesh import Mesh, mesh_bytes, read_mesh, vertex_normals
 from tonguetrack.model.mri.cloudfile import cloud_bytes
 from tonguetrack.tracker.bundled import bundled_model

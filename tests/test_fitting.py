@@ -8,7 +8,8 @@ from scipy.optimize import minimize
 
 from tonguetrack import InputError
 from tonguetrack.model.build import load_training_shapes, model_from_shapes, read_sample_database
-from tonguetrack.model.fitting import Cloud, fit_clouds, fit_points, fit_shapes
+from tonguetrack.model.cloud import Cloud
+from tonguetrack.model.fitting import fit_clouds, fit_points, fit_shapes
 from tonguetrack.model.mesh import vertex_normals
 from tonguetrack.tracker.bundled import bundled_model
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tonguetrack import InputError
-from tonguetrack.model.fitting import Cloud
+from tonguetrack.model.cloud import Cloud
 from tonguetrack.model.mri.cloudfile import cloud_bytes, read_cloud
 from tonguetrack.model.mri.diffusion import denoise
 from tonguetrack.model.mri.scan import Scan, scan_of

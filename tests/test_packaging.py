@@ -108,6 +108,7 @@ def test_the_wheel_holds_our_package_and_nothing_beside_it(built):
 PACKAGES_WITH_DATA = (
     "tonguetrack.model.data",
     "tonguetrack.recordings",
+    "tonguetrack.tracker.preferencepage",
     "tonguetrack.tracker.streams.page",
     "tonguetrack.tracker.streams.presets",
 )

@@ -39,8 +39,10 @@ TRACK_DEMO = ".venv/bin/tonguetrack track recordings/demo.csv --session recordin
 RENDER_DEMO = ".venv/bin/tonguetrack render demo.poses.csv --session recordings/demo.session.toml"
 DEMO = ".venv/bin/tonguetrack demo --seconds 5 --to "
 WITHOUT_END = ELSEWHERE + "test_window.py and test_page_browser.py, and .ci/run for some seconds"
+BY_PREFERENCE = ELSEWHERE + "test_mri_preference.py and test_preference_page.py"
 HEADS = ".venv/bin/tonguetrack mri phantom heads --speakers 1 --seed 7"
 BY_MODEL_TESTS = ELSEWHERE + "test_model_evaluation.py, with fewer samples"
+BY_CORPUS_TESTS = ELSEWHERE + "test_corpus.py, with dask's own local cluster"
 BY_FAULTS = ELSEWHERE + "test_cli_live_devices.py and the simulators' own tests: it runs until it is ended"
 
 README = {
@@ -98,10 +100,35 @@ DOCS = {
     ".venv/bin/tonguetrack doctor": ELSEWHERE + "test_doctor.py, where what is found may be anything",
     ".venv/bin/tonguetrack devices": HERE,
     HEADS: HERE,
+    ".venv/bin/tonguetrack mri build heads/dataset.toml -o heads.npz --report report": ELSEWHERE
+    + "test_mri_pipeline.py, with another set",
+    ".venv/bin/tonguetrack mri build --print-settings": HERE,
     ".venv/bin/tonguetrack mri denoise heads/scans/Speaker01_a.nii.gz -o smooth.nii.gz": HERE,
     ".venv/bin/tonguetrack mri segment smooth.nii.gz -o tissue.nii.gz": HERE,
     ".venv/bin/tonguetrack mri cloud smooth.nii.gz -o surface.ply": HERE,
     ".venv/bin/tonguetrack mri slice smooth.nii.gz -o slice.png --at 2.2 --cloud surface.ply": HERE,
+    (
+        ".venv/bin/tonguetrack mri match heads/scans/Speaker01_a.nii.gz --template tongue "
+        "--landmarks heads/landmarks/Speaker01_a.csv -o tongue-a.ply"
+    ): HERE,
+    (
+        ".venv/bin/tonguetrack mri match heads/scans/Speaker01_a.nii.gz --template palate "
+        "--landmarks heads/landmarks/Speaker01_palate.csv -o palate.ply"
+    ): HERE,
+    (
+        ".venv/bin/tonguetrack mri align palate.ply --from heads/scans/Speaker01_a.nii.gz "
+        "--to heads/scans/Speaker01_i.nii.gz -o palate-i.ply"
+    ): HERE,
+    ".venv/bin/tonguetrack mri denoise heads/scans/Speaker01_i.nii.gz -o smooth-i.nii.gz": HERE,
+    ".venv/bin/tonguetrack mri cloud smooth-i.nii.gz -o surface-i.ply": HERE,
+    ".venv/bin/tonguetrack mri restore surface-i.ply --palate palate-i.ply -o restored-i.ply": HERE,
+    (
+        ".venv/bin/tonguetrack mri match restored-i.ply --template tongue "
+        "--landmarks heads/landmarks/Speaker01_i.csv -o tongue-i.ply"
+    ): HERE,
+    ".venv/bin/tonguetrack mri preference make model.work -o test --partitions 2": BY_PREFERENCE,
+    ".venv/bin/tonguetrack mri preference serve test": BY_PREFERENCE,
+    ".venv/bin/tonguetrack mri preference tally test -o tally": BY_PREFERENCE,
     ".venv/bin/tonguetrack model evaluate speakers/samples.yaml -o report": BY_MODEL_TESTS,
     (
         ".venv/bin/tonguetrack model evaluate PATH/sampleDatabase.yaml --specificity --samples 20000 "
@@ -166,6 +193,10 @@ DOCS = {
     " --save-session speaker.toml --use joint": HERE,
     ".venv/bin/tonguetrack anatomy recordings/demo.csv --session session.toml"
     " --mesh tongue_000500.ply tongue_001500.ply tongue_002500.ply": HERE,
+    ".venv/bin/tonguetrack track recordings --out-folder poses": HERE,
+    ".venv/bin/tonguetrack track corpus --out-folder poses --scheduler tcp://192.168.0.7:8786": BY_CORPUS_TESTS,
+    ".venv/bin/dask scheduler": BY_CORPUS_TESTS,
+    ".venv/bin/dask worker tcp://192.168.0.7:8786 --nworkers auto --nthreads 1": BY_CORPUS_TESTS,
     ".venv/bin/tonguetrack convert recordings/demo.csv demo.npz": HERE,
     ".venv/bin/tonguetrack simulate recording hello.csv --speaker 5 --palate hello.palate.csv": HERE,
     ".venv/bin/tonguetrack track recordings/demo.csv --palate recordings/demo.palate.csv --save-session session.toml": HERE,
@@ -242,6 +273,12 @@ def test_the_flags_that_pages_name_exist():
         "mri segment",
         "mri cloud",
         "mri slice",
+        "mri match",
+        "mri align",
+        "mri restore",
+        "mri preference make",
+        "mri preference serve",
+        "mri preference tally",
         "simulate recording",
         "simulate device",
         "live",

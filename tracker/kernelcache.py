@@ -13,7 +13,11 @@ VARIABLE = "NUMBA_CACHE_DIR"
 KERNEL_MODULES = {
     "drivers.devices.rtc3d_decode": "RTC3D",
     "model.nearest": "specificity",
+    "model.neighbours": "neighbours in point clouds",
+    "model.surfacedistance": "distances to the truth",
+    "model.mri.bending": "template matching",
     "model.mri.diffusion": "denoising of scans",
+    "model.mri.palatealignment": "alignment of palates",
     "model.mri.phantom.tissue": "phantom's anatomy and volumes",
     "tracker.alignmentterms": "calibration",
     "tracker.anatomy": "joint speaker",

@@ -19,7 +19,8 @@ import numpy as np
 
 from .. import InputError
 from ..drivers.frames import Recording
-from ..model.fitting import Cloud, Fit, fit_clouds, fit_shapes
+from ..model.cloud import Cloud
+from ..model.fitting import Fit, fit_clouds, fit_shapes
 from ..model.mesh import Mesh, vertex_normals
 from ..model.multilinear import TongueModel
 from .anatomy import estimate_speaker

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ... import InputError
-from ..fitting import Cloud
+from ..cloud import Cloud
 
 PLACE, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 TYPES = {

@@ -5,9 +5,10 @@ from __future__ import annotations
 import io
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ... import InputError
-from ..fitting import Cloud
+from ..cloud import Cloud
 from ..mesh import FloatArray
 from .reading import library
 from .scan import Scan
@@ -17,6 +18,7 @@ PLANES = {"sagittal": (0, 1, 2), "coronal": (1, 0, 2), "axial": (2, 0, 1)}
 AXIS_NAMES = ("x, to the left, mm", "y, back, mm", "z, up, mm")
 MOST_PIXELS = 4000  # along one axis
 TICK_MM = 1.5  # how long a normal is drawn
+QUANTILES = (0.01, 0.99)  # of what a magnified part shows: black and white
 
 
 def middle_mm(scan: Scan) -> FloatArray:
@@ -51,6 +53,38 @@ def slice_values(
     values = np.where(inside, scan.at(points.reshape(-1, 3)), np.nan).reshape(points.shape[:2])
     half = pixel / 2
     return values, (steps[0][0] - half, steps[0][-1] + half, steps[1][0] - half, steps[1][-1] + half)
+
+
+def magnified(
+    values: FloatArray,
+    edges: tuple[float, float, float, float],
+    low: FloatArray,
+    high: FloatArray,
+    pixel_mm: float,
+) -> NDArray[np.uint8]:
+    """(down, right) the part between two corners (right, up), mm, of what `slice_values` gives.
+
+    Pixels have about the given size; voxels are interpolated. It is as bright as it can be: a bright spot elsewhere in
+    the scan shall not make it dark.
+    """
+    from scipy.ndimage import map_coordinates
+
+    pixel = (edges[1] - edges[0]) / values.shape[1]
+    count = np.maximum(np.round((high - low) / pixel_mm).astype(int), 1)
+    right, up = (
+        (
+            low[axis]
+            + (np.arange(count[axis]) + 0.5) / count[axis] * (high[axis] - low[axis])
+            - edges[2 * axis]
+        )
+        / pixel
+        - 0.5
+        for axis in (0, 1)
+    )
+    grid = np.meshgrid(up[::-1], right, indexing="ij")
+    pixels = map_coordinates(np.nan_to_num(values), grid, order=3, mode="nearest")
+    black, white = np.quantile(pixels, QUANTILES)
+    return np.clip(np.rint((pixels - black) * (255.0 / max(white - black, 1.0))), 0, 255).astype(np.uint8)
 
 
 def slice_png(scan: Scan, plane: str, at_mm: float, cloud: Cloud | None = None) -> bytes:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ... import InputError
-from ..fitting import Cloud
+from ..cloud import Cloud
 from ..mesh import FloatArray
 from .scan import Scan
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...atomic import write_atomically
-from ..mesh import Mesh, mesh_bytes
+from ..mesh import Mesh
+from ..multilinear import SurfaceMarks
+from ..sampledatabase import write_sample_database
 from .anatomy import training_anatomies
 from .articulation import PHONES, articulation_for, random_habits
 from .surface import tongue_surface
@@ -38,28 +38,13 @@ def training_shapes() -> NDArray[np.float64]:
 
 def write_samples(folder: str | Path) -> Path:
     """Writes the meshes and samples.yaml, whose path is returned; the same bytes every time."""
-    folder = Path(folder)
-    (folder / "meshes").mkdir(parents=True, exist_ok=True)
     template = tongue_template()
-    data = []
-    for anatomy, shapes in zip(training_anatomies(), training_shapes(), strict=True):
-        phonemes = []
-        for phone, vertices in zip(PHONES, shapes, strict=True):
-            path = f"meshes/{anatomy.name}_{FILE_NAMES[phone]}.ply"
-            write_atomically(folder / path, mesh_bytes(Mesh(vertices, template.faces), ".ply"))
-            phonemes.append({"prompt": phone, "path": path})
-        data.append({"name": anatomy.name, "phonemes": phonemes})
-    content = {
-        "provenance": PROVENANCE,
-        "meta": {"speakerAmount": len(data), "phonemeAmount": len(PHONES)},
-        "data": data,
-        "template": {
-            "landmarks": template.landmarks,
-            "regions": {name: list(vertices) for name, vertices in template.regions.items()},
-            "midsagittal": list(template.midsagittal),
-        },
+    people = [anatomy.name for anatomy in training_anatomies()]
+    meshes = {
+        (name, phone): Mesh(vertices, template.faces)
+        for name, shapes in zip(people, training_shapes(), strict=True)
+        for phone, vertices in zip(PHONES, shapes, strict=True)
     }
-    # JSON is YAML too, and json writes it the same way everywhere.
-    text = json.dumps(content, ensure_ascii=False, indent=1)
-    write_atomically(folder / "samples.yaml", text.encode())
-    return folder / "samples.yaml"
+    names = {(name, phone): f"{name}_{FILE_NAMES[phone]}" for name, phone in meshes}
+    marks = SurfaceMarks(template.landmarks, template.regions, template.midsagittal)
+    return write_sample_database(Path(folder), PROVENANCE, people, tuple(PHONES), meshes, names, marks)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tonguetrack.model.fitting import Cloud
+from tonguetrack.model.cloud import Cloud
 from tonguetrack.model.mri.diffusion import denoise
 from tonguetrack.model.mri.scan import Scan, scan_of
 from tonguetrack.model.mri.surface import surface_points, voxel_surface

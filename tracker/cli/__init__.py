@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from ... import InputError, __version__
 
 EXIT_BAD_INPUT = 2
+EXIT_LEFT_OUT = 3
+"""Of commands that work on many things: some of them could not be used, each was told in a sentence, the rest is done."""
 
 
 def build_parser() -> argparse.ArgumentParser:

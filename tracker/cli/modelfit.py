@@ -13,7 +13,8 @@ from ... import InputError
 from .names import keep_apart, named_model, prepare_folder
 
 if TYPE_CHECKING:
-    from ...model.fitting import Cloud, Fit
+    from ...model.cloud import Cloud
+    from ...model.fitting import Fit
     from ...model.mesh import FloatArray, Mesh
     from ...model.multilinear import Mode, TongueModel
 
@@ -129,7 +130,7 @@ def _registered(surface: Mesh | Cloud, model: TongueModel) -> FloatArray | None:
 
 
 def _cloud(surface: Mesh | Cloud, landmarks: dict[int, FloatArray]) -> Cloud:
-    from ...model.fitting import Cloud
+    from ...model.cloud import Cloud
     from ...model.mesh import Mesh, vertex_normals
 
     if isinstance(surface, Mesh):

@@ -24,6 +24,7 @@ from .names import (
     replayed,
 )
 from .showing import poses_to_show
+from .workers import add_worker_flags
 
 if TYPE_CHECKING:
     from ...drivers.frames import Recording
@@ -49,6 +50,10 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
                        help="1: anatomy and pose free in every frame; 2: anatomy fixed (default)")  # fmt: skip
     track.add_argument("--out", metavar="FILE", help="poses.csv, .json (as the authors' tracker writes) or .npz; "
                        "for several recordings a folder, or a name with {name} in it")  # fmt: skip
+    track.add_argument("--out-folder", metavar="DIR", help="track a whole corpus into this folder, several recordings at a "
+                       "time; what is there already is not tracked again")  # fmt: skip
+    track.add_argument("--again", action="store_true", help="with --out-folder: also what is unchanged")
+    add_worker_flags(track)
     track.add_argument("--palate", metavar="FILE", help="put this palate into the session that is saved: a trace in the "
                        "recording's axes, or a recording of a swept probe")  # fmt: skip
     track.add_argument("--save-session", metavar="FILE",
@@ -90,6 +95,16 @@ class Job:
 
 def run_track(args: argparse.Namespace) -> int:
     experiments = (1, 2) if args.experiment == "both" else (int(args.experiment),)
+    if args.out_folder:
+        from .corpus import run_corpus
+
+        folder = Path(os.path.abspath(args.out_folder))
+        jobs, left_out = plan_jobs(args.recordings, f"{args.out_folder}{os.sep}", experiments, folder)
+        return run_corpus(args, jobs, left_out, experiments)
+    if args.again or args.jobs is not None or args.scheduler:
+        raise InputError(
+            "--again, --jobs and --scheduler track a corpus; say where to with --out-folder DIR."
+        )
     jobs, left_out = plan_jobs(args.recordings, args.out, experiments)
     if len(jobs) > 1 and (args.osc or args.save_session or args.view):
         flag = "--osc" if args.osc else "--save-session" if args.save_session else "--view"
@@ -219,10 +234,11 @@ def _show(run: TrackingRun, model: TongueModel, name: str, speaker: str | None) 
 
 
 def plan_jobs(
-    places: Sequence[str], out: str | None, experiments: tuple[int, ...]
+    places: Sequence[str], out: str | None, experiments: tuple[int, ...], passed_over: Path | None = None
 ) -> tuple[list[Job], list[tuple[Path, str]]]:
     """Finds the recordings and gives each its output files; also what was left out, with the reason.
 
+    passed_over: an absolute folder; where it lies below a place, nothing is looked for in it.
     Raises InputError where there is nothing to track or two outputs would have one name.
     """
     from ...drivers import find_recordings
@@ -235,6 +251,8 @@ def plan_jobs(
             found.append(Path(place))
             continue
         items = find_recordings(place)
+        if passed_over is not None and Path(os.path.abspath(place)) in passed_over.parents:
+            items = [item for item in items if passed_over not in Path(os.path.abspath(item.path)).parents]
         recordings = [item.path for item in items if item.is_recording]
         if not recordings:
             raise InputError(

@@ -43,7 +43,7 @@ from .protocol import (
     state_text,
     told_text,
 )
-from .visitors import Door, door_at, same_origin
+from .visitors import Door, door_at, page_headers, same_origin
 
 RATE_HZ = 60.0
 MAX_PAGES = 32
@@ -432,16 +432,5 @@ def _plain(status: HTTPStatus) -> Response:
 
 
 def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
-    """The page loads nothing from elsewhere, is shown in no other page, and tells nobody its address."""
-    headers = {
-        "Content-Type": kind,
-        "Content-Length": str(len(body)),
-        "Connection": "close",
-        "Cache-Control": "no-store",
-        "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-        "Cross-Origin-Resource-Policy": "same-origin",
-        "Referrer-Policy": "no-referrer",
-        "X-Content-Type-Options": "nosniff",
-    }
+    headers = {**page_headers(kind, len(body)), "Connection": "close"}
     return Response(status.value, status.phrase, Headers(headers), body)

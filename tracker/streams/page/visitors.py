@@ -62,6 +62,20 @@ def same_origin(origin: str | None, host_header: str) -> bool:
     return origin is None or origin in (f"http://{host_header}", f"https://{host_header}")
 
 
+def page_headers(kind: str, length: int) -> dict[str, str]:
+    """Of an answer: its page loads nothing from elsewhere, is shown in no other page, and tells nobody its address."""
+    return {
+        "Content-Type": kind,
+        "Content-Length": str(length),
+        "Cache-Control": "no-store",
+        "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+        "Cross-Origin-Resource-Policy": "same-origin",
+        "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff",
+    }
+
+
 def reachable_address(place: str) -> str:
     """The address that others can use for one that this computer listens at."""
     if not ipaddress.ip_address(place.partition("%")[0]).is_unspecified:
