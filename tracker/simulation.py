@@ -91,19 +91,12 @@ class Simulation:
 
 
 @dataclass(frozen=True)
-class HeadMotion:
-    """rotation (frames, 3, 3), translation_mm (frames, 3): recorded = rotation @ position + translation."""
-
-    rotation: FloatArray
-    translation_mm: FloatArray
-
-
-@dataclass(frozen=True)
 class Truth:
     """What is true of a simulated recording, in mm and the model frame.
 
     places: where each tongue coil sits, by role: mm behind the tip along the middle of the neutral tongue, and share
     of the way from the middle to the left edge; positions: (frames, coils, 3) without noise, dropouts or head motion;
+    head_rotation (frames, 3, 3), head_translation_mm (frames, 3): recorded = rotation @ position + translation;
     phone_times_s: (phones + 1,) where each phone begins; phones: their names; contour_times_s (c,), contours
     (c, points, 3): the tongue's middle from tip to vallecula, the same flesh throughout; palate: (n, 3) the middle of
     the hard palate from front to back.
@@ -111,7 +104,8 @@ class Truth:
 
     places: dict[str, tuple[float, float]]
     positions: FloatArray
-    head: HeadMotion
+    head_rotation: FloatArray
+    head_translation_mm: FloatArray
     phone_times_s: FloatArray
     phones: tuple[str, ...]
     contour_times_s: FloatArray
@@ -139,10 +133,11 @@ def simulate(simulation: Simulation) -> tuple[Recording, Truth]:
     contour_times = np.arange(0.0, times[-1], 1.0 / CONTOUR_RATE_HZ)
     middles = {phone: speaker.middle(phone) for phone in simulation.phones}
     contours = _moved([middles[phone] for phone in phones], contour_times, simulation.phone_s)
-    recording, head = recorded(simulation, positions, speaker.anatomy.name)
+    recording, rotation, translation = recorded(simulation, positions, speaker.anatomy.name)
     return recording, Truth(
-        places, positions, head, starts, phones, contour_times, contours, speaker.palate(), speaker.anatomy
-    )
+        places, positions, rotation, translation, starts, phones, contour_times, contours, speaker.palate(),
+        speaker.anatomy,
+    )  # fmt: skip
 
 
 def frame_times(simulation: Simulation) -> FloatArray:
@@ -169,12 +164,15 @@ def minimum_jerk(
     return index, np.where(index == 0, 1.0, smooth)
 
 
-def recorded(simulation: Simulation, positions: FloatArray, speaker: str) -> tuple[Recording, HeadMotion]:
-    """What an articulograph makes of true positions (frames, coils, 3): head motion, noise, dropouts, rounding."""
+def recorded(
+    simulation: Simulation, positions: FloatArray, speaker: str
+) -> tuple[Recording, FloatArray, FloatArray]:
+    """What an articulograph makes of true positions (frames, coils, 3), by head motion, noise, dropouts and rounding;
+    and the head's rotation (frames, 3, 3) and translation (frames, 3)."""
     times = frame_times(simulation)
     random = np.random.default_rng([simulation.seed, 5])
-    head = _head_motion(times, simulation.head_motion, random)
-    measured = np.einsum("tab,tcb->tca", head.rotation, positions) + head.translation_mm[:, None, :]
+    rotation, translation = _head_motion(times, simulation.head_motion, random)
+    measured = np.einsum("tab,tcb->tca", rotation, positions) + translation[:, None, :]
     measured += random.normal(scale=simulation.noise_mm, size=measured.shape) if simulation.noise_mm else 0.0
     measured = np.round(measured, RECORDED_DECIMALS)
     measured[_dropouts(simulation, len(times), random)] = np.nan
@@ -189,7 +187,7 @@ def recorded(simulation: Simulation, positions: FloatArray, speaker: str) -> tup
         notes=(f"Synthetic: speaker {speaker}, outside the training set of the bundled model.",),
         extra={"simulation": json.dumps(asdict(simulation), ensure_ascii=False), "made_by": f"tonguetrack {__version__}"},
     )  # fmt: skip
-    return recording, head
+    return recording, rotation, translation
 
 
 def write_simulation(simulation: Simulation, path: str | Path) -> tuple[Path, Path]:
@@ -205,10 +203,13 @@ def write_simulation(simulation: Simulation, path: str | Path) -> tuple[Path, Pa
     }
     arrays = {
         name: getattr(truth, name)
-        for name in ("positions", "phone_times_s", "contour_times_s", "contours", "palate")
-    }
-    if simulation.head_motion:
-        arrays |= {"head_rotation": truth.head.rotation, "head_translation_mm": truth.head.translation_mm}
+        for name in (
+            "positions", "head_rotation", "head_translation_mm", "phone_times_s", "contour_times_s", "contours",
+            "palate",
+        )
+    }  # fmt: skip
+    if not simulation.head_motion:
+        del arrays["head_rotation"], arrays["head_translation_mm"]
     stream = io.BytesIO()
     text = json.dumps(words, ensure_ascii=False).encode()
     np.savez_compressed(stream, words=np.frombuffer(text, dtype=np.uint8),
@@ -250,19 +251,21 @@ def _moved(targets: Sequence[FloatArray], times_s: FloatArray, phone_s: float) -
     return np.asarray(before + share.reshape(-1, *(1,) * (stacked.ndim - 1)) * (now - before))
 
 
-def _head_motion(times: FloatArray, moving: bool, random: np.random.Generator) -> HeadMotion:
+def _head_motion(
+    times: FloatArray, moving: bool, random: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
     """A head that nods, turns and drifts by some degrees and millimetres about the model's origin."""
     rotation = np.broadcast_to(np.eye(3), (len(times), 3, 3)).copy()
     translation = np.zeros((len(times), 3))
     if not moving:
-        return HeadMotion(rotation, translation)
+        return rotation, translation
     from scipy.spatial.transform import Rotation
 
     frequency = random.uniform(0.15, 0.6, (2, 3))
     phase = random.uniform(0.0, 2.0 * np.pi, (2, 3))
     angles = np.array([6.0, 2.0, 5.0]) * np.sin(2 * np.pi * frequency[0] * times[:, None] + phase[0])
     translation = np.array([6.0, 8.0, 5.0]) * np.sin(2 * np.pi * frequency[1] * times[:, None] + phase[1])
-    return HeadMotion(np.asarray(Rotation.from_euler("xyz", angles, degrees=True).as_matrix()), translation)
+    return np.asarray(Rotation.from_euler("xyz", angles, degrees=True).as_matrix()), translation
 
 
 def _dropouts(simulation: Simulation, count: int, random: np.random.Generator) -> np.ndarray:
