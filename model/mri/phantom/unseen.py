@@ -69,7 +69,7 @@ def unseen_speaker(number: int, phones: Iterable[str] = PHONES) -> UnseenSpeaker
     return _shipped()[number] if number in SHIPPED else computed_speaker(number, phones)
 
 
-def computed_speaker(number: int, phones: Iterable[str]) -> UnseenSpeaker:
+def computed_speaker(number: int, phones: Iterable[str] = PHONES) -> UnseenSpeaker:
     """As `unseen_speaker`, and never from the file."""
     from .making import phantom_speaker
 
