@@ -1,4 +1,8 @@
-"""Recordings of a synthetic speaker outside the training set, with everything that is true about them."""
+"""Recordings of a synthetic speaker outside the training set, with everything that is true about them.
+
+The speakers are of the family of the MRI phantom that the bundled model was built from (`model.mri.phantom`), whose head
+frame is the model's frame.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from ..atomic import write_atomically
 from ..drivers import FrameOfReference, Recording, write_recording
 from ..model.mri.phantom.anatomy import Anatomy
 from ..model.mri.phantom.articulation import PHONES
-from ..model.mri.phantom.unseen import unseen_speaker
+from ..model.mri.phantom.unseen import SHIPPED, unseen_speaker
 from .pose import FloatArray
 
 # Places of coils: mm behind the tip along the middle of the neutral tongue, and share of the way to its left edge.
@@ -88,6 +92,11 @@ class Simulation:
     @property
     def length_s(self) -> float:
         return self.seconds if self.seconds is not None else self.phone_s * len(self.phones)
+
+    @property
+    def ships(self) -> bool:
+        """Whether the speaker comes with the package; any other is computed, in some seconds."""
+        return self.speaker in SHIPPED
 
 
 @dataclass(frozen=True)
