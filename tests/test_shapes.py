@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from parametric import parametric_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from parametric import parametric_model
 from scipy.spatial import cKDTree
 
 from tonguetrack import InputError
@@ -313,7 +313,7 @@ def test_what_a_model_cannot_do_stays_near_0():
     meter = ShapeMeter(MODEL)
     column = meter.names.index("tip_left")
     for pose in MODEL.pose.training:
-        assert meter.measure(MODEL.speaker.mean, pose)[column] < 0.2
+        assert meter.measure(MODEL.speaker.mean, pose)[column] < 0.35
 
 
 def test_the_pose_directions_are_rebased_between_their_published_ranges():
