@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .mesh import FloatArray, vertex_normals
+from .mesh import FloatArray, IndexArray, vertex_normals
 from .multilinear import TongueModel
 
 
@@ -13,7 +13,8 @@ def midsagittal_vertices(model: TongueModel) -> NDArray[np.intp]:
     """Vertices of the upper surface near the plane x = 0, ordered from tip to root.
 
     Taken from the model's own marks where it has them; else found on the mean shape: within one
-    median edge length of the plane, and not facing down or front-down (underside and base).
+    median edge length of the plane, not facing down or front-down (underside and base), and in one
+    piece with the highest of them (a base's rim below the tip may be turned up).
     """
     if model.marks.midsagittal:
         return np.asarray(model.marks.midsagittal, dtype=np.intp)
@@ -21,7 +22,7 @@ def midsagittal_vertices(model: TongueModel) -> NDArray[np.intp]:
     normals = vertex_normals(vertices, model.faces)
     near = np.abs(vertices[:, 0]) <= _median_edge(vertices, model)
     upper = (normals[:, 2] > 0) | ((normals[:, 1] > 0) & (normals[:, 2] > -0.5))
-    found = np.flatnonzero(near & upper)
+    found = _in_one_piece(np.flatnonzero(near & upper), vertices, model.faces)
     return np.asarray(found[np.argsort(_angle_from_front(vertices[found]))], dtype=np.intp)
 
 
@@ -34,6 +35,18 @@ def upper_surface_vertices(model: TongueModel) -> NDArray[np.intp]:
 def _median_edge(vertices: FloatArray, model: TongueModel) -> float:
     edges = np.concatenate([model.faces[:, [0, 1]], model.faces[:, [1, 2]], model.faces[:, [2, 0]]])
     return float(np.median(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)))
+
+
+def _in_one_piece(chosen: NDArray[np.intp], vertices: FloatArray, faces: IndexArray) -> NDArray[np.intp]:
+    """Those of the chosen vertices (n,) that edges between chosen ones join to the highest."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = edges[np.isin(edges, chosen).all(axis=1)]
+    graph = coo_array((np.ones(len(edges)), edges.T), shape=(len(vertices), len(vertices)))
+    piece = connected_components(graph, directed=False)[1]
+    return chosen[piece[chosen] == piece[chosen[np.argmax(vertices[chosen, 2])]]] if len(chosen) else chosen
 
 
 def _angle_from_front(points: FloatArray) -> FloatArray:

@@ -7,20 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from parametric import parametric_model, simulate_parametric
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from tonguetrack import InputError
 from tonguetrack.drivers import FrameOfReference, Recording, open_recording, write_recording
 from tonguetrack.model.files import save_model
-from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.calibration import Figures, Sources, _doubt, calibrate
 from tonguetrack.tracker.calibrationreport import REPORT_FILES, draw_residuals, draw_views
 from tonguetrack.tracker.cli import main
 from tonguetrack.tracker.headcorrection import head_motion
 from tonguetrack.tracker.session import Alignment, load_session
 from tonguetrack.tracker.setup import complete_setup, preparation_of
-from tonguetrack.tracker.simulation import HEAD_COILS, Simulation, simulate
+from tonguetrack.tracker.simulation import HEAD_COILS, Simulation
 from tonguetrack.tracker.smoothing import PRESETS
 from tonguetrack.tracker.tracking import track_recording
 
@@ -66,7 +66,7 @@ def vault(back):
 def files(tmp_path_factory):
     """A take with head motion, 5 % dropouts and a slipping reference; a bite plate, a palate sweep, a bad plate."""
     place = tmp_path_factory.mktemp("calibration")
-    take, truth = simulate(
+    take, truth = simulate_parametric(
         Simulation(
             ("ə", "i", "ɑ", "u", "s", "a", "ʃ", "ɔ"),
             (*TONGUE, *HEAD),
@@ -94,6 +94,7 @@ def files(tmp_path_factory):
         paths = np.stack([probe, *(np.tile(HEAD_COILS[role], (1000, 1)) for role in HEAD)], axis=1)
         noisy = in_the_file(paths) + random.normal(scale=0.3, size=paths.shape)
         write_recording(recording_of(("palate_probe", *HEAD), noisy, name), place / f"{name}.npz")
+    save_model(parametric_model(), place / "model.npz")
     return place, truth
 
 
@@ -105,7 +106,8 @@ def calibrated(files):
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = main(
             [
-                *("calibrate", str(place / "take.npz"), "--bite-plane", str(place / "bite.npz")),
+                *("calibrate", str(place / "take.npz"), "--model", str(place / "model.npz")),
+                *("--bite-plane", str(place / "bite.npz")),
                 *(
                     "--palate",
                     str(place / "palate.npz"),
@@ -189,7 +191,7 @@ def everything_at_once(seed, places):
     Eight seconds with a moving head, a mirrored and turned file, a bite plate, a slipping reference, 5 % dropouts and
     0.3 mm of noise. places: role -> mm behind the front end of the mean contour.
     """
-    model = bundled_model()
+    model = parametric_model()
     random = np.random.default_rng(seed)
     contour = model.mean_vertices()[list(model.marks.midsagittal)]
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(contour, axis=0), axis=1))])
@@ -254,7 +256,7 @@ def test_the_session_loads_again_and_gives_the_same_poses(calibrated):
     place, _, told, _ = calibrated
     session = load_session(place / "session.toml")
     take = open_recording(place / "take.npz")
-    poses = track_recording(take, bundled_model(), session, (2,)).experiment_2
+    poses = track_recording(take, parametric_model(), session, (2,)).experiment_2
     after = told["after"]["experiment_2"]
     assert poses.residual_mm[poses.tracked].mean() == pytest.approx(after["residual_mean_mm"], abs=1e-12)
     assert after["frames"] == int(poses.tracked.sum()) > 900
@@ -299,7 +301,8 @@ def test_the_last_line_says_what_to_do_next(calibrated):
     place, _, _, words = calibrated
     last = words.splitlines()[-1]
     assert f"look at {place / 'report' / 'report.md'}" in last
-    assert f"; then tonguetrack track {place / 'take.npz'} --session {place / 'session.toml'}" in last
+    command = f"tonguetrack track {place / 'take.npz'} --model {place / 'model.npz'}"
+    assert f"; then {command} --session {place / 'session.toml'}" in last
 
 
 def test_a_fit_that_bends_the_model_or_stays_away_is_doubted(calibrated):

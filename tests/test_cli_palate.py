@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from tonguetrack.drivers import FrameOfReference, Recording, open_recording, write_recording
+from tonguetrack.model.mri.phantom.anatomy import head_of
+from tonguetrack.model.mri.phantom.tissue import roof_height
+from tonguetrack.model.mri.phantom.unseen import unseen_speaker
 from tonguetrack.tracker.bundled import bundled_recording
 from tonguetrack.tracker.cli import main
 from tonguetrack.tracker.palate import read_palate
 from tonguetrack.tracker.session import load_session, session_toml
-from tonguetrack.tracker.simulation import unseen_speaker
 
 DEVICE_AXES = FrameOfReference("front", "left", "up", "upper incisors")
 TO_DEVICE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # from left, back, up
@@ -65,15 +67,17 @@ def refused(capsys, *arguments, **files):
 def test_the_trace_beside_a_recording_is_that_speakers_palate_above_that_speakers_tongue(tmp_path, capsys):
     out = tmp_path / "take.csv"
     palate_file = tmp_path / "traces" / "palate.csv"
-    assert run("simulate", "recording", out, "--speaker", 4, "--seconds", 3, "--palate", palate_file) == 0
+    assert run("simulate", "recording", out, "--speaker", 3, "--seconds", 3, "--palate", palate_file) == 0
     assert "points of this speaker's palate" in capsys.readouterr().err
     palate = read_palate(palate_file, open_recording(out).frame, "mm")
-    anatomy, _ = unseen_speaker(4)
     points = palate.points_mm
-    np.testing.assert_allclose(points[:, 2], anatomy.palate_z(points[:, 0], points[:, 1]), atol=6e-4)
+    head = head_of(unseen_speaker(3).anatomy)
+    roof = [head.size * roof_height(0.0, y / head.size, head) for y in points[:, 1]]
+    np.testing.assert_allclose(points[:, 2], roof, atol=6e-4)
     assert (points[:, 0] == 0).all() and 40 < np.ptp(points[:, 1]) < 60
     with np.load(tmp_path / "take.truth.npz") as truth:
         contours = truth["contours"].astype(np.float64)
+        np.testing.assert_allclose(truth["palate"], points, atol=6e-4)
     highest = np.nanmax(palate.above(contours))
     assert -4.0 < highest <= 0.0
 
@@ -114,7 +118,7 @@ def test_a_trace_in_the_recordings_axes_comes_into_the_session_as_the_coils_come
     told = capsys.readouterr().err
     assert "only in cm it is as long as a palate" in told
     assert (
-        "palate: 51 points over 50 mm front to back (palate.csv); 99 % of the tongue samples stay below"
+        "palate: 47 points over 46 mm front to back (palate.csv); 99 % of the tongue samples stay below"
         in told
     )
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tonguetrack.model.synthetic import Anatomy
+from tonguetrack.model.mri.phantom.anatomy import PALATE_END_MM, ROOF_START_MM, STEP_MM, Anatomy, roof_of
 from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.streams.contact import REGIONS, ContactMeter, gaps_below, segments_of
 from tonguetrack.tracker.streams.landmarks import contour_with_parts
@@ -16,6 +16,13 @@ CONTOUR = MODEL.mean_vertices()[contour_with_parts(MODEL)[0]]
 def flat_palate(height, front=-20.0, back=80.0, points=50):
     y = np.linspace(front, back, points)
     return np.column_stack([np.zeros(points), y, np.full(points, height)])
+
+
+def hard_palate(points):
+    """Of the phantom's reference speaker."""
+    roof = roof_of(Anatomy("reference"))
+    y = np.linspace(ROOF_START_MM, PALATE_END_MM, points)
+    return np.column_stack([0 * y, y, np.interp(y, STEP_MM * np.arange(len(roof)), roof)])
 
 
 def test_below_a_flat_palate_the_gap_is_the_distance_to_the_highest_point():
@@ -68,22 +75,14 @@ def test_the_gap_falls_one_for_one_as_the_palate_comes_down():
 
 
 def test_a_dense_sweep_gives_what_a_sparse_trace_gives():
-    anatomy = Anatomy("reference")
-
-    def palate(points):
-        y = np.linspace(0.0, 58.0, points)
-        return np.column_stack([np.zeros(points), y, anatomy.palate_z(np.zeros(points), y)])
-
-    sparse, dense = (ContactMeter(MODEL, palate(points)) for points in (60, 6000))
+    sparse, dense = (ContactMeter(MODEL, hard_palate(points)) for points in (60, 6000))
     for pose in MODEL.pose.training:
         one, other = (meter.measure(MODEL.speaker.mean, pose) for meter in (sparse, dense))
         assert one.gap_mm == pytest.approx(other.gap_mm, abs=0.05)
 
 
 def test_the_synthetic_speakers_narrow_where_phonetics_says():
-    y = np.linspace(0.0, 60.0, 100)
-    palate = np.column_stack([0 * y, y, Anatomy("reference").palate_z(0 * y, y)])
-    meter = ContactMeter(MODEL, palate)
+    meter = ContactMeter(MODEL, hard_palate(100))
     regions = {
         phone: meter.regions[int(np.nanargmin(meter.measure(MODEL.speaker.mean, pose).regions))]
         for phone, pose in zip(MODEL.pose.names, MODEL.pose.training, strict=True)

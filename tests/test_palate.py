@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from tonguetrack import InputError
 from tonguetrack.drivers import FrameOfReference, open_recording
 from tonguetrack.model.midsagittal import midsagittal_vertices
-from tonguetrack.model.synthetic.anatomy import training_anatomies
+from tonguetrack.model.mri.phantom.anatomy import STEP_MM, roof_of
+from tonguetrack.model.mri.phantom.making import phantom_speaker
 from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.palate import (
     Palate,
@@ -419,9 +420,14 @@ def test_a_models_palate_is_above_its_mean_tongue_and_below_the_true_palate_of_i
     mean = palate.above(model.mean_vertices()[contour])
     assert np.nanmax(mean) < 0.0
     y, z = palate.curve
-    true = np.mean([anatomy.palate_z(np.zeros(len(y)), y) for anatomy in training_anatomies()], axis=0)
-    vault = (y > 8.0) & (y < 50.0)
-    assert vault.sum() > 35
+    roofs = []
+    for number in range(1, model.speaker.entries + 1):
+        anatomy = phantom_speaker(0, number).anatomy
+        roof = anatomy.size * roof_of(anatomy)
+        roofs.append(np.interp(y, anatomy.size * STEP_MM * np.arange(len(roof)), roof))
+    true = np.mean(roofs, axis=0)
+    vault = (y > 8.0) & (y < 44.0)
+    assert vault.sum() > 30
     assert ((true - z)[vault] > 0.0).all() and (true - z)[vault].max() < 8.0
 
 
@@ -433,8 +439,8 @@ def test_no_pose_of_the_average_speaker_rises_above_the_models_palate():
         midsagittal_vertices(model),
     )
     above = np.array([palate.above(speaker.vertices(pose)[contour]) for pose in model.pose.training])
-    assert np.nanmax(above) < 0.3
-    assert np.nanmax(above) > -0.3  # and some pose touches it
+    # The curve is smoothed, and some pose touches it.
+    assert -0.3 < np.nanmax(above) < 0.6
 
 
 def test_a_model_that_is_no_tongue_has_no_palate():

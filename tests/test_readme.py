@@ -198,7 +198,7 @@ DOCS = {
     ".venv/bin/dask scheduler": BY_CORPUS_TESTS,
     ".venv/bin/dask worker tcp://192.168.0.7:8786 --nworkers auto --nthreads 1": BY_CORPUS_TESTS,
     ".venv/bin/tonguetrack convert recordings/demo.csv demo.npz": HERE,
-    ".venv/bin/tonguetrack simulate recording hello.csv --speaker 5 --palate hello.palate.csv": HERE,
+    ".venv/bin/tonguetrack simulate recording hello.csv --speaker 3 --palate hello.palate.csv": HERE,
     ".venv/bin/tonguetrack track recordings/demo.csv --palate recordings/demo.palate.csv --save-session session.toml": HERE,
     ".venv/bin/tonguetrack simulate recording visit.csv --seconds 4 --head-motion --dropouts 0.05 "
     "--coils tongue_tip,tongue_blade,tongue_dorsum,head_nose,head_left,head_right,head_upper_incisor": HERE,

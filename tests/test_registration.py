@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from parametric import parametric_model, simulate_parametric
 from scipy.interpolate import PchipInterpolator
 
 from tonguetrack import InputError
 from tonguetrack.model.midsagittal import midsagittal_vertices
-from tonguetrack.tracker.bundled import bundled_model
 from tonguetrack.tracker.palate import curve_palate
 from tonguetrack.tracker.registration import FirstGuess, _believable, _Posterior, fit_alignment, handedness
 from tonguetrack.tracker.session import Energy
-from tonguetrack.tracker.simulation import Simulation, simulate
+from tonguetrack.tracker.simulation import Simulation
 
 ROLES = ("tongue_tip", "tongue_blade", "tongue_dorsum")
 NEAR = FirstGuess(np.eye(3), np.zeros(3), 3.0, 4.0, "a bite plane")
@@ -21,7 +21,7 @@ FAR = FirstGuess(np.eye(3), np.zeros(3), 40.0, 10.0, "axes alone")
 
 @pytest.fixture(scope="module")
 def model():
-    return bundled_model()
+    return parametric_model()
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +154,7 @@ def test_three_coils_of_a_speaker_of_the_model_are_as_far_off_as_they_are_said_t
 def test_a_tongue_that_never_moves_says_little_however_long_it_is_recorded(model):
     """Of a model's speaker as of a stranger: one pose can be followed from anywhere nearby."""
     random = np.random.default_rng(4)
-    stranger, _ = simulate(Simulation(("a",), speaker=4, seconds=1.0, noise_mm=0.1))
+    stranger, _ = simulate_parametric(Simulation(("a",), speaker=4, seconds=1.0, noise_mm=0.1))
     for coils in (coils_of(model, 0, frames=1)[0], stranger.positions[:1] * [0, 1, 1]):
         still = np.repeat(coils, 400, axis=0) + random.normal(0, 0.1, (400, 3, 3)) * [0, 1, 1]
         found = fit_alignment(model, still, ROLES, NEAR, Energy())
@@ -185,7 +185,7 @@ def test_gaps_and_wild_samples_do_not_tell(model):
 
 def test_a_stranger_ends_nearer_than_the_uncertainty_says_and_is_not_believed_to_be_exact(model):
     """What such a speaker's coils do not determine stays with the first guess: 0.3 mm does not hold here."""
-    recording, _ = simulate(
+    recording, _ = simulate_parametric(
         Simulation(
             ("a", "ʃ", "i", "o", "u", "s", "e", "ɑ", "ə"), speaker=4, seconds=3.0, rate_hz=50.0, noise_mm=0.1
         )
@@ -251,7 +251,7 @@ def test_the_same_coils_give_the_same_alignment(simple):
 
 def test_a_palate_keeps_the_contour_below_itself(simple):
     """A palate that lies lower than the tongue would go pushes the tongue down in the model, or forward, or round."""
-    recording, _ = simulate(
+    recording, _ = simulate_parametric(
         Simulation(("a", "i", "u", "s"), speaker=4, seconds=0.8, rate_hz=50.0, noise_mm=0.1)
     )
     coils = recording.positions * [0, 1, 1]

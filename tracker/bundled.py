@@ -18,7 +18,7 @@ SESSION = ("tonguetrack.recordings", "demo.session.toml")
 
 
 def bundled_model() -> TongueModel:
-    """The default model, made by this project's own pipeline from synthetic speakers: not anatomy."""
+    """The default model, made by this project's own pipeline from scans of a phantom: not anatomy."""
     with bundled_model_path() as path:
         return load_model(path)
 

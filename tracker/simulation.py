@@ -1,39 +1,36 @@
-"""Recordings of a synthetic speaker outside the training set, with everything that is true about them."""
+"""Recordings of a synthetic speaker outside the training set, with everything that is true about them.
+
+The speakers are of the family of the MRI phantom that the bundled model was built from (`model.mri.phantom`), whose head
+frame is the model's frame.
+"""
 
 from __future__ import annotations
 
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import InputError, __version__
 from ..atomic import write_atomically
 from ..drivers import FrameOfReference, Recording, write_recording
-from ..model.synthetic import (
-    PHONES,
-    Anatomy,
-    Articulation,
-    Habits,
-    articulation_for,
-    blend,
-    random_anatomy,
-    random_habits,
-    tongue_surface,
-    tongue_template,
-)
+from ..model.mri.phantom.anatomy import Anatomy
+from ..model.mri.phantom.articulation import PHONES
+from ..model.mri.phantom.unseen import SHIPPED, unseen_speaker
 from .pose import FloatArray
 
-# Places of coils: mm behind the tip along the tongue's midline, and across it in degrees of the template.
+# Places of coils: mm behind the tip along the middle of the neutral tongue, and share of the way to its left edge.
 TONGUE_COILS = {
     "tongue_tip": (8.0, 0.0),
     "tongue_blade": (25.0, 0.0),
     "tongue_dorsum": (45.0, 0.0),
     "tongue_back": (56.0, 0.0),
-    "tongue_left": (25.0, 35.0),
-    "tongue_right": (25.0, -35.0),
+    "tongue_left": (25.0, 0.6),
+    "tongue_right": (25.0, -0.6),
 }
 # Reference coils on the head, which no articulation moves: (x, y, z) mm in the model frame.
 HEAD_COILS = {
@@ -42,21 +39,17 @@ HEAD_COILS = {
     "head_right": (-66.0, 88.0, 34.0),
     "head_upper_incisor": (0.0, -2.0, 4.0),
 }
-CONTROL_RATE_HZ = 100.0
 CONTOUR_RATE_HZ = 25.0
 TRANSITION_SHARE = 0.7  # of a phone's time is movement, the rest is held
 DROPOUT_S = 0.04
 RECORDED_DECIMALS = 3  # a micrometre: far below any articulograph's resolution
-PALATE_FROM_MM = 2.0  # behind the incisors: nearer, a probe coil has no room
-PALATE_STEP_MM = 1.0
-UNSEEN_SPEAKER_OFFSET = 1000  # seeds below this belong to the training speakers' habits
 
 
 @dataclass(frozen=True)
 class Simulation:
     """What to simulate. phones: the sequence, repeated until `seconds` (None: once); coils: roles.
 
-    speaker: seed of the anatomy and its habits; noise_mm: standard deviation per coordinate;
+    speaker: its number among the unseen ones; noise_mm: standard deviation per coordinate;
     dropouts: share of each coil's samples that are missing, in runs of about 40 ms.
     """
 
@@ -100,18 +93,25 @@ class Simulation:
     def length_s(self) -> float:
         return self.seconds if self.seconds is not None else self.phone_s * len(self.phones)
 
+    @property
+    def ships(self) -> bool:
+        """Whether the speaker comes with the package; any other is computed, in some seconds."""
+        return self.speaker in SHIPPED
+
 
 @dataclass(frozen=True)
 class Truth:
     """What is true of a simulated recording, in mm and the model frame.
 
-    vertices: each tongue coil's vertex of the synthetic template, by role; positions: (frames, coils, 3)
-    without noise, dropouts or head motion; head_rotation (frames, 3, 3), head_translation_mm (frames, 3):
-    recorded = rotation @ position + translation; phone_times_s: (phones + 1,) where each phone begins;
-    phones: their names; contour_times_s (c,), contours (c, points, 3): the mid-sagittal upper surface.
+    places: where each tongue coil sits, by role: mm behind the tip along the middle of the neutral tongue, and share
+    of the way from the middle to the left edge; positions: (frames, coils, 3) without noise, dropouts or head motion;
+    head_rotation (frames, 3, 3), head_translation_mm (frames, 3): recorded = rotation @ position + translation;
+    phone_times_s: (phones + 1,) where each phone begins; phones: their names; contour_times_s (c,), contours
+    (c, points, 3): the tongue's middle from tip to vallecula, the same flesh throughout; palate: (n, 3) the middle of
+    the hard palate from front to back.
     """
 
-    vertices: dict[str, int]
+    places: dict[str, tuple[float, float]]
     positions: FloatArray
     head_rotation: FloatArray
     head_translation_mm: FloatArray
@@ -119,76 +119,84 @@ class Truth:
     phones: tuple[str, ...]
     contour_times_s: FloatArray
     contours: FloatArray
+    palate: FloatArray
     anatomy: Anatomy
-    habits: Habits
 
 
 def simulate(simulation: Simulation) -> tuple[Recording, Truth]:
     """The recording, in the model frame apart from head motion, and its truth. Deterministic."""
-    from scipy.interpolate import CubicSpline
+    speaker = unseen_speaker(simulation.speaker, simulation.phones)
+    phones, starts = phone_sequence(simulation)
+    times = frame_times(simulation)
+    places = {role: TONGUE_COILS[role] for role in simulation.coils if role in TONGUE_COILS}
+    resting = {
+        phone: np.array(
+            [
+                speaker.at(phone, *places[role]) if role in places else HEAD_COILS[role]
+                for role in simulation.coils
+            ]
+        )
+        for phone in simulation.phones
+    }
+    positions = _moved([resting[phone] for phone in phones], times, simulation.phone_s)
+    contour_times = np.arange(0.0, times[-1], 1.0 / CONTOUR_RATE_HZ)
+    middles = {phone: speaker.middle(phone) for phone in simulation.phones}
+    contours = _moved([middles[phone] for phone in phones], contour_times, simulation.phone_s)
+    recording, rotation, translation = recorded(simulation, positions, speaker.anatomy.name)
+    return recording, Truth(
+        places, positions, rotation, translation, starts, phones, contour_times, contours, speaker.palate(),
+        speaker.anatomy,
+    )  # fmt: skip
 
-    anatomy, habits = unseen_speaker(simulation.speaker)
+
+def frame_times(simulation: Simulation) -> FloatArray:
+    """(frames,) s."""
     count = max(2, round(simulation.length_s * simulation.rate_hz))
-    times = np.arange(count) / simulation.rate_hz
-    phones, starts = _phone_sequence(simulation)
-    vertices = {role: coil_vertex(role) for role in simulation.coils if role in TONGUE_COILS}
+    return np.asarray(np.arange(count) / simulation.rate_hz)
 
-    # The surface is evaluated at the control rate; speech moves slowly enough for splines between.
-    control = np.arange(0.0, times[-1] + 2.0 / CONTROL_RATE_HZ, 1.0 / CONTROL_RATE_HZ)
-    targets = [articulation_for(anatomy, phone, habits) for phone in phones]
-    # Of each shape only the coils' and, now and then, the contour's points are kept: an hour has 360,000.
-    midsagittal = list(tongue_template().midsagittal)
-    every = max(1, round(CONTROL_RATE_HZ / CONTOUR_RATE_HZ))
-    sampled = np.empty((len(control), len(vertices), 3))
-    contours = np.empty((len(control[::every]), len(midsagittal), 3))
-    for index, t in enumerate(control):
-        shape = tongue_surface(anatomy, _articulation_at(t, targets, simulation.phone_s))
-        sampled[index] = shape[list(vertices.values())]
-        if index % every == 0:
-            contours[index // every] = shape[midsagittal]
-    moving = CubicSpline(control, sampled.reshape(len(control), -1))(times).reshape(count, -1, 3)
 
-    positions = np.empty((count, len(simulation.coils), 3))
-    order = list(vertices)
-    for index, role in enumerate(simulation.coils):
-        positions[:, index] = moving[:, order.index(role)] if role in vertices else HEAD_COILS[role]
+def phone_sequence(simulation: Simulation) -> tuple[tuple[str, ...], FloatArray]:
+    """The phones as they follow each other, and (phones + 1,) s where they begin."""
+    count = max(1, int(np.ceil(simulation.length_s / simulation.phone_s - 1e-9)))
+    phones = tuple(simulation.phones[index % len(simulation.phones)] for index in range(count))
+    return phones, np.asarray(np.arange(count + 1) * simulation.phone_s, dtype=np.float64)
+
+
+def minimum_jerk(
+    times_s: FloatArray, phone_s: float, phone_count: int
+) -> tuple[NDArray[np.intp], FloatArray]:
+    """(n,) the phone at each time, and how far (0 to 1) the way there from the phone before has been gone: a
+    minimum-jerk movement into each phone's target, which is then held."""
+    index = np.minimum((times_s / phone_s).astype(np.intp), phone_count - 1)
+    progress = ((times_s - index * phone_s) / (TRANSITION_SHARE * phone_s)).clip(0.0, 1.0)
+    smooth = progress**3 * (10.0 - 15.0 * progress + 6.0 * progress**2)
+    return index, np.where(index == 0, 1.0, smooth)
+
+
+def recorded(
+    simulation: Simulation, positions: FloatArray, speaker: str
+) -> tuple[Recording, FloatArray, FloatArray]:
+    """What an articulograph makes of true positions (frames, coils, 3), by head motion, noise, dropouts and rounding;
+    and the head's rotation (frames, 3, 3) and translation (frames, 3)."""
+    times = frame_times(simulation)
     random = np.random.default_rng([simulation.seed, 5])
     rotation, translation = _head_motion(times, simulation.head_motion, random)
-    recorded = np.einsum("tab,tcb->tca", rotation, positions) + translation[:, None, :]
-    recorded += random.normal(scale=simulation.noise_mm, size=recorded.shape) if simulation.noise_mm else 0.0
-    recorded = np.round(recorded, RECORDED_DECIMALS)
-    recorded[_dropouts(simulation, count, random)] = np.nan
-
-    truth = Truth(
-        vertices, positions, rotation, translation, starts, phones, control[::every],
-        contours, anatomy, habits,
-    )  # fmt: skip
+    measured = np.einsum("tab,tcb->tca", rotation, positions) + translation[:, None, :]
+    measured += random.normal(scale=simulation.noise_mm, size=measured.shape) if simulation.noise_mm else 0.0
+    measured = np.round(measured, RECORDED_DECIMALS)
+    measured[_dropouts(simulation, len(times), random)] = np.nan
     moved = "after head motion" if simulation.head_motion else "the model's"
     recording = Recording(
         coils=simulation.coils,
-        positions=recorded,
+        positions=measured,
         times_s=times,
         rate_hz=simulation.rate_hz,
         format="simulated",
         frame=FrameOfReference("left", "back", "up", f"upper incisors, {moved}"),
-        notes=(f"Synthetic: speaker {anatomy.name}, outside the training set of the bundled model.",),
+        notes=(f"Synthetic: speaker {speaker}, outside the training set of the bundled model.",),
         extra={"simulation": json.dumps(asdict(simulation), ensure_ascii=False), "made_by": f"tonguetrack {__version__}"},
     )  # fmt: skip
-    return recording, truth
-
-
-def unseen_speaker(seed: int) -> tuple[Anatomy, Habits]:
-    """A synthetic speaker who is not in the training set of the bundled model."""
-    return random_anatomy(seed), random_habits(UNSEEN_SPEAKER_OFFSET + seed)
-
-
-def coil_vertex(role: str) -> int:
-    """The template's vertex under a tongue coil."""
-    template = tongue_template()
-    distance, angle = TONGUE_COILS[role]
-    row = int(np.argmin(np.abs(template.s - template.tip_s - distance)))
-    column = int(np.argmin(np.abs(template.theta - angle)))
-    return row * len(template.theta) + column
+    return recording, rotation, translation
 
 
 def write_simulation(simulation: Simulation, path: str | Path) -> tuple[Path, Path]:
@@ -196,24 +204,25 @@ def write_simulation(simulation: Simulation, path: str | Path) -> tuple[Path, Pa
     path = Path(path)
     recording, truth = simulate(simulation)
     words = {
-        "vertices": truth.vertices,
+        "places": truth.places,
         "phones": list(truth.phones),
         "anatomy": asdict(truth.anatomy),
-        "habits": asdict(truth.habits),
         "simulation": asdict(simulation),
         "model_frame": "x left, y back, z up; mm; mid-sagittal plane x = 0",
     }
     arrays = {
-        name: getattr(truth, name).astype(np.float32)
+        name: getattr(truth, name)
         for name in (
             "positions", "head_rotation", "head_translation_mm", "phone_times_s", "contour_times_s", "contours",
+            "palate",
         )
     }  # fmt: skip
     if not simulation.head_motion:
         del arrays["head_rotation"], arrays["head_translation_mm"]
     stream = io.BytesIO()
     text = json.dumps(words, ensure_ascii=False).encode()
-    np.savez_compressed(stream, words=np.frombuffer(text, dtype=np.uint8), **arrays)
+    np.savez_compressed(stream, words=np.frombuffer(text, dtype=np.uint8),
+                        **{name: array.astype(np.float32) for name, array in arrays.items()})  # fmt: skip
     write_recording(recording, path)
     write_atomically(truth_path(path), stream.getvalue())
     return path, truth_path(path)
@@ -234,10 +243,7 @@ def palate_trace(simulation: Simulation) -> FloatArray:
             "--palate: a trace has one place, but with --head-motion the mouth moves in the recording's axes; leave one "
             "of the two out."
         )
-    anatomy, _ = unseen_speaker(simulation.speaker)
-    back = np.arange(PALATE_FROM_MM, anatomy.hard_palate_mm, PALATE_STEP_MM)
-    middle = np.zeros(len(back))
-    return np.column_stack([middle, back, anatomy.palate_z(middle, back)])
+    return unseen_speaker(simulation.speaker, ()).palate()
 
 
 def write_palate(points_mm: FloatArray, path: str | Path) -> None:
@@ -246,20 +252,12 @@ def write_palate(points_mm: FloatArray, path: str | Path) -> None:
     write_atomically(path, ("\n".join(lines) + "\n").encode())
 
 
-def _phone_sequence(simulation: Simulation) -> tuple[tuple[str, ...], FloatArray]:
-    count = max(1, int(np.ceil(simulation.length_s / simulation.phone_s - 1e-9)))
-    phones = tuple(simulation.phones[index % len(simulation.phones)] for index in range(count))
-    return phones, np.asarray(np.arange(count + 1) * simulation.phone_s, dtype=np.float64)
-
-
-def _articulation_at(time_s: float, targets: list[Articulation], phone_s: float) -> Articulation:
-    """Minimum-jerk movement into each phone's target, which is then held."""
-    index = min(int(time_s / phone_s), len(targets) - 1)
-    if index == 0:
-        return targets[0]
-    progress = min((time_s - index * phone_s) / (TRANSITION_SHARE * phone_s), 1.0)
-    smooth = progress**3 * (10.0 - 15.0 * progress + 6.0 * progress**2)
-    return blend(targets[index - 1], targets[index], smooth)
+def _moved(targets: Sequence[FloatArray], times_s: FloatArray, phone_s: float) -> FloatArray:
+    """(n, ...) from each phone's target to the next."""
+    index, share = minimum_jerk(times_s, phone_s, len(targets))
+    stacked = np.array(targets)
+    before, now = stacked[np.maximum(index - 1, 0)], stacked[index]
+    return np.asarray(before + share.reshape(-1, *(1,) * (stacked.ndim - 1)) * (now - before))
 
 
 def _head_motion(

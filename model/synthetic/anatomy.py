@@ -61,7 +61,7 @@ class Anatomy:
 
 
 def training_anatomies() -> tuple[Anatomy, ...]:
-    """The eleven speakers of the bundled model: seven smaller, four larger, no two alike."""
+    """The eleven speakers of the sample database: seven smaller, four larger, no two alike."""
     rows = (
         # size mouth pharynx width thick blade palate apex dome arch wall
         (0.97, 1.02, 0.92, 0.98, 1.00, 1.00, 14.0, 30.0, 2.3, 23.0, 83.0),

@@ -2,7 +2,7 @@
 
     python tests/bench/placement.py --seeds 10
 
-Each seed is one case of `everything_at_once` in tests/test_calibration.py: a speaker of the bundled model, eight
+Each seed is one case of `everything_at_once` in tests/test_calibration.py: a speaker of the model of parametric speakers, eight
 seconds with a moving head, a mirrored and turned file, a bite plate, a slipping reference, 5 % dropouts and 0.3 mm of
 noise; once with four tongue coils and once with three. Printed for each number of coils: how many cases are within the
 bounds, the worst and the root mean square of the errors, and how many are more than three stated standard deviations away.

@@ -54,8 +54,8 @@ def _add_recording(kinds: argparse._SubParsersAction[argparse.ArgumentParser]) -
     recording.add_argument("output", metavar="OUT", help="the recording (.csv, .json or .npz)")
     recording.add_argument("--phones", default=PHONES, metavar="'P P ...'",
                            help="the phone sequence, with spaces between (default: %(default)s)")  # fmt: skip
-    recording.add_argument("--speaker", type=int, default=1, metavar="SEED",
-                           help="which speaker outside the training set (default 1)")  # fmt: skip
+    recording.add_argument("--speaker", type=int, default=1, metavar="N",
+                           help="which speaker outside the training set (default 1; from 4 on, and 0, some seconds to compute)")  # fmt: skip
     recording.add_argument("--seconds", type=float, help="repeat the sequence for that long (default: once)")
     recording.add_argument(
         "--phone-seconds", type=float, default=0.2, metavar="S", help="time a phone (default 0.2)"
@@ -73,7 +73,9 @@ def _add_recording(kinds: argparse._SubParsersAction[argparse.ArgumentParser]) -
     recording.add_argument("--head-motion", action="store_true", help="move the head; all coils move with it")
     recording.add_argument("--palate", metavar="FILE", help="also write a trace of this speaker's palate: x, y, z of "
                            "a point a line, mm, in the recording's axes")  # fmt: skip
-    recording.add_argument("--seed", type=int, default=1, help="of noise, dropouts, habits (default 1)")
+    recording.add_argument(
+        "--seed", type=int, default=1, help="of noise, dropouts and head motion (default 1)"
+    )
     recording.set_defaults(run=run_recording)
 
 
@@ -144,6 +146,8 @@ def run_recording(args: argparse.Namespace) -> int:
         head_motion=args.head_motion,
         seed=args.seed,
     )
+    if not simulation.ships:
+        print(f"speaker {args.speaker}: computing each phone, which takes some seconds ...", file=sys.stderr)
     if args.palate:
         trace = palate_trace(simulation)
         taken = [Path(args.output).resolve(), truth_path(args.output).resolve()]

@@ -110,7 +110,7 @@ def random_anatomy(name: str, random: np.random.Generator) -> Anatomy:
 @lru_cache(maxsize=4)
 def head_of(anatomy: Anatomy) -> Head:
     """The tables of a speaker."""
-    along = np.arange(0.0, TABLE_END_MM + STEP_MM / 2, STEP_MM)
+    along = _along()
     up = np.arange(HEIGHT_LOW_MM, HEIGHT_HIGH_MM + STEP_MM / 2, STEP_MM)
     arch = _arch(anatomy, along)
     # Lordosis: the neck's curve bulges towards the mouth at the height of the chin.
@@ -128,7 +128,7 @@ def head_of(anatomy: Anatomy) -> Head:
     )
     return Head(
         anatomy.size,
-        _roof(anatomy, along),
+        roof_of(anatomy),
         arch,
         _plan(along, arch),
         wall,
@@ -142,8 +142,8 @@ def head_of(anatomy: Anatomy) -> Head:
     )
 
 
-def _roof(anatomy: Anatomy, along: FloatArray) -> FloatArray:
-    """Gum, alveolar ridge, vault, posterior nasal spine."""
+def roof_of(anatomy: Anatomy) -> FloatArray:
+    """z of the hard palate's middle on y = 0, STEP_MM, ...: gum, alveolar ridge, vault, posterior nasal spine."""
     top = anatomy.palate_mm
     apex = anatomy.palate_apex_mm
     ridge = anatomy.ridge_mm
@@ -151,8 +151,12 @@ def _roof(anatomy: Anatomy, along: FloatArray) -> FloatArray:
         [0, 3.5, 6.5, 10.5, 14.0, 20.0, apex, 38.0, PALATE_END_MM, 60, 101],
         [1.0, 2.2, 4.0 - 0.4 * ridge, 5.6 - ridge, 0.6 * top - 0.5 * ridge, 0.86 * top, top, top - 0.5]
         + [top - 2.6, top - 5.0, top - 8.0],
-        along,
+        _along(),
     )
+
+
+def _along() -> FloatArray:
+    return np.arange(0.0, TABLE_END_MM + STEP_MM / 2, STEP_MM)
 
 
 def _arch(anatomy: Anatomy, along: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ from .landmarks import palate_landmarks, placed, tongue_landmarks
 from .render import Imaging, acquired, labels_and_signal
 from .surfaces import palate_surface, tongue_surface
 from .tissue import Pose
-from .tongue import tongue_of
+from .tongue import Tongue, tongue_of
 from .truth import ScanTruth, write_truth
 
 FloatArray = NDArray[np.float64]
@@ -67,6 +67,15 @@ def phantom_speaker(seed: int, number: int) -> PhantomSpeaker:
     return PhantomSpeaker(number, anatomy, PALATE_PHONES[int(random.integers(len(PALATE_PHONES)))])
 
 
+def speakers_tongue(seed: int, speaker: PhantomSpeaker, phone: str) -> Tongue:
+    """The tongue of a speaker who holds a phone; the same for the same numbers."""
+    number, place = speaker.number, PHONES.index(phone)
+    articulation = speakers_articulation(
+        phone, _random(seed, _HABITS, number), _random(seed, _TAKE, number, place)
+    )
+    return tongue_of(speaker.anatomy, head_of(speaker.anatomy), articulation)
+
+
 def phantom_scan(
     seed: int, speaker: PhantomSpeaker, phone: str, imaging: Imaging | None = None
 ) -> PhantomScan:
@@ -74,10 +83,7 @@ def phantom_scan(
     number, place = speaker.number, PHONES.index(phone)
     head = head_of(speaker.anatomy)
     size = speaker.anatomy.size
-    articulation = speakers_articulation(
-        phone, _random(seed, _HABITS, number), _random(seed, _TAKE, number, place)
-    )
-    tongue = tongue_of(speaker.anatomy, head, articulation)
+    tongue = speakers_tongue(seed, speaker, phone)
     to_world = _grid(seed, number)
     head_to_world = _head_position(seed, number, place, size)
     to_head = (np.linalg.inv(head_to_world) @ to_world)[:3] / size

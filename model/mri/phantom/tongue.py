@@ -8,6 +8,7 @@ All at reference size in the head frame (`anatomy`), mm.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,8 +63,7 @@ class Tongue:
 
 def tongue_of(anatomy: Anatomy, head: Head, articulation: Articulation) -> Tongue:
     """The tongue of a speaker in an articulation, its volume that of the speaker's neutral tongue."""
-    neutral = articulation_of("ə")
-    wanted = shaped(anatomy, head, neutral, anatomy.tongue_mm).volume_mm3
+    wanted = neutral_volume(anatomy)
     low, high = -LARGEST_SWELLING_MM, LARGEST_SWELLING_MM
     parts = _prepared(anatomy, head, articulation)
     for _ in range(12):
@@ -73,6 +73,12 @@ def tongue_of(anatomy: Anatomy, head: Head, articulation: Articulation) -> Tongu
         else:
             high = swelling
     return _pressed(parts, articulation, 0.5 * (low + high))
+
+
+@lru_cache(maxsize=4)
+def neutral_volume(anatomy: Anatomy) -> float:
+    """mm^3 at reference size, which a speaker's tongue has in every articulation."""
+    return shaped(anatomy, head_of(anatomy), articulation_of("ə"), anatomy.tongue_mm).volume_mm3
 
 
 def shaped(anatomy: Anatomy, head: Head, articulation: Articulation, swelling_mm: float) -> Tongue:
