@@ -25,7 +25,7 @@ from . import stages, templates
 from .bootstrapping import Cell, complete_shapes, head_motions, model_of
 from .caching import KEY_LENGTH, Cache
 from .dataset import Dataset, Landmarks, Problem, Region, ScanEntry
-from .settings import BuildSettings, as_table, settings_of
+from .settings import BuildSettings, as_table, settings_digest, settings_of
 from .templates import Template
 
 INDEX = "results.json"
@@ -194,7 +194,11 @@ def shapes_of(index: Index, tongues: Mapping[Cell, FloatArray]) -> TrainingShape
     their speakers and phones."""
     speakers = [name for name in index.dataset.speakers if any(name == cell[0] for cell in tongues)]
     phones = [name for name in index.dataset.phones if any(name == cell[1] for cell in tongues)]
-    provenance = {"source": index.dataset.source.name, "data": index.dataset.provenance}
+    provenance = {
+        "source": index.dataset.source.name,
+        "data": index.dataset.provenance,
+        "settings": settings_digest(index.settings),
+    }
     return complete_shapes(
         tongues, speakers, phones, templates.tongue(), index.settings.completion, provenance
     )

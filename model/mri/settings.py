@@ -13,6 +13,8 @@ A table of TOML holds those that differ, in the data set's [settings] or in a fi
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import tomllib
 from collections.abc import Mapping
@@ -180,6 +182,11 @@ def settings_of(table: Mapping[str, Any], where: str, base: BuildSettings | None
 def settings_toml(settings: BuildSettings) -> str:
     """All settings with what they mean; `settings_of` reads them back."""
     return "\n".join(_lines(settings, "")) + "\n"
+
+
+def settings_digest(settings: BuildSettings) -> str:
+    """16 hexadecimal digits that name exactly these values."""
+    return hashlib.sha256(json.dumps(as_table(settings), sort_keys=True).encode()).hexdigest()[:16]
 
 
 def as_table(settings: Any) -> dict[str, Any]:
