@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -432,6 +433,15 @@ def test_flags_that_make_no_sense_are_refused_before_anything_is_done(
     assert main(["mri", "build", str(phantom), *flags]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "m.npz").exists()
+
+
+def test_the_docs_program_runs_with_what_a_build_has_left(work, tmp_path, monkeypatch, capsys):
+    page = Path(__file__).resolve().parents[1] / "docs" / "mri-build.md"
+    (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "heads.work").symlink_to(work)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(program, page, "exec"), {})
+    assert "Speaker02" in capsys.readouterr().out
 
 
 def test_a_build_that_was_killed_goes_on_where_it_was(listed, options, tmp_path):
