@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -21,14 +22,14 @@ from tonguetrack.model.build import read_sample_database
 from tonguetrack.model.mesh import read_mesh
 from tonguetrack.model.mri.caching import Cache
 from tonguetrack.model.mri.cloudfile import read_cloud
-from tonguetrack.model.mri.dataset import load_dataset
+from tonguetrack.model.mri.dataset import Problem, load_dataset
 from tonguetrack.model.mri.phantom.making import truth_path
 from tonguetrack.model.mri.phantom.surfaces import BURIED
 from tonguetrack.model.mri.phantom.truth import read_truth
 from tonguetrack.model.mri.pipeline import STAGES, build
 from tonguetrack.model.mri.results import assembled, load_result, read_index, stored_cloud, write_index
 from tonguetrack.model.mri.settings import BuildSettings, settings_toml
-from tonguetrack.parallel import local
+from tonguetrack.parallel import cluster, local
 from tonguetrack.tracker.cli import main, mribuild
 
 USUAL = BuildSettings()
@@ -203,6 +204,24 @@ def test_workers_elsewhere_are_told_whole_paths(phantom, work, monkeypatch):
 
     build(load_dataset("dataset.toml"), QUICK, os.path.relpath(work), Looking(), until="scans")
     assert [place.is_absolute() for place in places] == [True]
+
+
+def test_a_cluster_makes_the_same_results_to_the_bit(phantom, work, tmp_path, monkeypatch):
+    """The scans of one speaker, on two workers of Dask; the data set named as from its own folder."""
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.chdir(phantom.parent)
+    dataset = load_dataset("dataset.toml").without([Problem("Speaker02", None, "not here")])
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=60
+        ) as made,
+        cluster(made.scheduler_address) as executor,
+    ):
+        index = build(dataset, NO_ROUNDS, os.path.relpath(tmp_path / "work"), executor, until="scans")
+    before = read_index(work)
+    for cell, key in index.surfaces.items():
+        assert key == before.surfaces[cell]
+        assert Cache(tmp_path / "work").path(key).read_bytes() == Cache(work).path(key).read_bytes()
 
 
 # What fails -----------------------------------------------------------------------------------------
@@ -432,6 +451,17 @@ def test_flags_that_make_no_sense_are_refused_before_anything_is_done(
     assert main(["mri", "build", str(phantom), *flags]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "m.npz").exists()
+
+
+def test_the_docs_program_runs_with_what_a_build_has_left(work, tmp_path):
+    page = Path(__file__).resolve().parents[1] / "docs" / "mri-build.md"
+    (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "heads.work").symlink_to(work)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Speaker02" in done.stdout
 
 
 def test_a_build_that_was_killed_goes_on_where_it_was(listed, options, tmp_path):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from dataclasses import is_dataclass
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -73,6 +75,21 @@ def test_only_what_is_said_differs(tmp_path):
     assert changed.rounds == 2 and changed.tongue.rule.radius_mm == 5.0
     assert changed.tongue.rule.angle_deg == BuildSettings().tongue.rule.angle_deg
     assert changed.palate == BuildSettings().palate
+
+
+def test_the_docs_example_is_understood_and_its_table_of_defaults_is_right():
+    text = (Path(__file__).resolve().parents[1] / "docs" / "mri-build.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    assert settings_of(tomllib.loads(example), "text") != BuildSettings()
+    rows = dict(re.findall(r"^\| `(\w+\.?\w*)` \| [^|]* \| ([^|]*) \|", text, re.MULTILINE))
+    usual = BuildSettings()
+    assert float(rows["tongue_prior.h"]) == usual.tongue_prior.h
+    assert rows["completion"] == usual.completion
+    assert rows["contact.everywhere"] == str(usual.contact.everywhere).lower()
+    matching = f"{usual.tongue.smoothness:g} to {usual.tongue.least_smoothness:g} and "
+    matching += f"{usual.palate.smoothness:g} to {usual.palate.least_smoothness:g}, "
+    matching += f"{usual.tongue.rule.radius_mm:g} to {usual.tongue.last_rule.radius_mm:g} mm"
+    assert f"| {matching} |" in text
 
 
 @pytest.mark.parametrize(
