@@ -64,6 +64,19 @@ def rigid_motion(source: FloatArray, target: FloatArray) -> RigidMotion:
     return RigidMotion(rotation, goal - rotation @ centre)
 
 
+def upright(shape: FloatArray, mirror: NDArray[np.intp]) -> RigidMotion:
+    """What lays a shape (n, 3) mm evenly about the plane x = 0: half of the motion onto its own mirror image.
+
+    mirror: (n,) the vertex on the other side. Raises InputError as `rigid_motion`.
+    """
+    from scipy.spatial.transform import Rotation
+
+    whole = rigid_motion(shape, shape[mirror] * (-1.0, 1.0, 1.0))
+    half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(whole.rotation).as_rotvec()).as_matrix()
+    centre = shape.mean(axis=0)
+    return RigidMotion(half, 0.5 * (centre + whole.apply(centre)) - half @ centre)
+
+
 def procrustes(shapes: FloatArray, frame: FloatArray, iterations: int = ITERATIONS) -> Alignment:
     """Shapes (s, n, 3) mm brought to their common mean by rotations and translations, until nothing moves any more.
 

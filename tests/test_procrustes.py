@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tonguetrack import InputError
-from tonguetrack.model.procrustes import RigidMotion, carried_over, procrustes, rigid_motion
+from tonguetrack.model.procrustes import RigidMotion, carried_over, procrustes, rigid_motion, upright
 
 
 def palate(seed: int = 0) -> np.ndarray:
@@ -123,3 +123,21 @@ def test_what_does_not_tell_how_it_is_turned_is_refused():
         procrustes(palate()[None], palate()[:-1])
     with pytest.raises(InputError, match="the source has 40, the target 39"):
         rigid_motion(palate(), palate()[:-1])
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=30, deadline=None)
+def test_a_shape_that_is_alike_on_both_sides_is_laid_upright(seed):
+    half = palate(seed)
+    shape, mirror = np.vstack([half, half * (-1, 1, 1)]), np.roll(np.arange(80), 40)
+    random = np.random.default_rng(seed)
+    lying = RigidMotion(
+        Rotation.from_rotvec(random.normal(scale=0.3, size=3)).as_matrix(), random.normal(size=3)
+    )
+    moved = lying.apply(shape)
+    found = upright(moved, mirror)
+    laid = found.apply(moved)
+    np.testing.assert_allclose(laid[mirror], laid * (-1, 1, 1), atol=1e-9)
+    # What is upright already stays where it is.
+    again = upright(laid, mirror)
+    np.testing.assert_allclose(again.apply(laid), laid, atol=1e-9)

@@ -22,7 +22,7 @@ from . import stages, templates
 from .bootstrapping import Cell
 from .caching import Cache
 from .cloudfile import cloud_bytes
-from .results import Index, shapes_of, tongues_in_head
+from .results import Index, shapes_of, tongues_in_head, upright_motions
 
 
 def export(work: str | Path, index: Index, folder: str | Path) -> None:
@@ -56,7 +56,8 @@ def export(work: str | Path, index: Index, folder: str | Path) -> None:
             write_mesh(cell, "first", cache.load(index.tongues[cell][0])["vertices"], tongue)
             write_mesh(cell, "tongue", cache.load(index.tongues[cell][-1])["vertices"], tongue)
     if index.used:
-        shapes = shapes_of(index, heads := tongues_in_head(index, cache))
+        heads = tongues_in_head(index, cache, upright_motions(index, cache))
+        shapes = shapes_of(index, heads)
         meshes = {cell: Mesh(vertices, tongue) for cell, vertices in heads.items()}
         write_sample_database(
             folder, index.dataset.provenance, shapes.speakers, shapes.prompts, meshes, names, shapes.marks

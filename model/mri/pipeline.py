@@ -215,10 +215,9 @@ def _matched(index: Index, making: _Making) -> Index:
 def _bootstrapped(index: Index, making: _Making) -> Index:
     prior = index.settings.tongue_prior
     for number in range(1, index.settings.rounds + 1):
-        model = model_of(
-            shapes_of(index, tongues_in_head(index, making.cache)), prior.speaker_modes, prior.pose_modes
-        )
         motions = motions_of(index, making.cache)
+        tongues = tongues_in_head(index, making.cache, motions)
+        model = model_of(shapes_of(index, tongues), prior.speaker_modes, prior.pose_modes)
         rows = {
             cell: (
                 Stored(index.clouds[cell]),
@@ -250,7 +249,7 @@ def _finished(index: Index, making: _Making) -> Index:
         for cell in dataset.scans
         if cell not in index.used
     ]
-    shapes = shapes_of(index, tongues_in_head(index, making.cache))
+    shapes = shapes_of(index, tongues_in_head(index, making.cache, motions_of(index, making.cache)))
     problems += [
         Problem(
             name, None, f"{name}: no tongue of this speaker is left; the model does not know this speaker."

@@ -20,7 +20,7 @@ from ..build import TrainingShapes
 from ..cloud import Cloud
 from ..mesh import FloatArray
 from ..multilinear import TongueModel
-from ..procrustes import RigidMotion
+from ..procrustes import RigidMotion, upright
 from . import stages, templates
 from .bootstrapping import Cell, complete_shapes, head_motions, model_of
 from .caching import KEY_LENGTH, Cache
@@ -141,8 +141,8 @@ def assembled(work: str | Path, index: Index) -> BuildResult:
     tongue, palate = templates.tongue(), templates.palate()
     matches = {cell: [cache.load(key) for key in index.tongues[cell]] for cell in _cells(index)}
     aligned = {cell: cache.load(index.aligned[cell]) for cell in matches}
-    motions = motions_of(index, cache)
-    shapes = shapes_of(index, tongues_in_head(index, cache))
+    motions = upright_motions(index, cache)
+    shapes = shapes_of(index, tongues_in_head(index, cache, motions))
     scans = {}
     for cell, found in matches.items():
         scans[cell] = ScanResult(
@@ -183,9 +183,21 @@ def motions_of(index: Index, cache: Cache) -> dict[Cell, RigidMotion]:
     return head_motions(own, in_scans, templates.palate())
 
 
-def tongues_in_head(index: Index, cache: Cache) -> dict[Cell, FloatArray]:
-    """The last meshes, of those that are part of the model: (n, 3) mm in the head frame."""
+def upright_motions(index: Index, cache: Cache) -> dict[Cell, RigidMotion]:
+    """The same, to the frame of the finished model: the mean of all tongues lies evenly about its plane x = 0.
+
+    The palates alone say where the heads are; which way a head looks they say less well, for they are nearly round.
+    """
     motions = motions_of(index, cache)
+    mean = np.mean(list(tongues_in_head(index, cache, motions).values()), axis=0)
+    turn = upright(mean, templates.tongue().mirror)
+    return {cell: turn.after(motion) for cell, motion in motions.items()}
+
+
+def tongues_in_head(
+    index: Index, cache: Cache, motions: Mapping[Cell, RigidMotion]
+) -> dict[Cell, FloatArray]:
+    """The last meshes, of those that are part of the model: (n, 3) mm in the head frame, where the motions lead."""
     return {cell: motions[cell].apply(cache.load(index.tongues[cell][-1])["vertices"]) for cell in index.used}
 
 
