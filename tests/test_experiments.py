@@ -306,7 +306,7 @@ def test_the_report_says_synthetic_where_the_model_is(tmp_path, capsys):
     assert main(["experiment", str(demo), "-o", str(tmp_path)]) == 0
     page = (tmp_path / "report.md").read_text(encoding="utf-8")
     (line,) = [line for line in page.splitlines() if line.startswith("- Model:")]
-    assert "synthetic: parametric speakers" in line and "synthetic" in capsys.readouterr().err
+    assert "synthetic: phantom" in line and "synthetic" in capsys.readouterr().err
 
 
 REFUSED = {

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import working
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -104,7 +105,7 @@ def test_progress_counts_what_is_kept_as_done(cache):
 
 def test_processes_share_one_folder(cache):
     with local(2) as executor:
-        kept = run_step(cache, DOUBLED, [(number,) for number in range(5)], executor)
+        kept = run_step(cache, Step("twice", 1, working.twice), [(number,) for number in range(5)], executor)
     assert [float(cache.load(one.key)["twice"][0]) for one in kept] == [0.0, 2.0, 4.0, 6.0, 8.0]
 
 

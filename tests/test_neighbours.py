@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from parametric import parametric_model
 
 from tonguetrack import InputError
 from tonguetrack.model.cloud import Cloud
 from tonguetrack.model.fitting import fit_clouds
 from tonguetrack.model.mesh import vertex_normals
 from tonguetrack.model.neighbours import NeighbourRule, SurfaceIndex
-from tonguetrack.tracker.bundled import bundled_model
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -125,8 +125,8 @@ def test_what_cannot_be_searched_is_refused():
 
 @pytest.fixture(scope="module")
 def tongue():
-    """The bundled model, a usual tongue of it, and that as a cloud with stray points 2.5 mm above its upper side."""
-    model = bundled_model()
+    """The parametric model, a usual tongue of it, and that as a cloud with stray points 2.5 mm above its upper side."""
+    model = parametric_model()
     random = np.random.default_rng(5)
     s, p = (
         mode.mean + 0.7 * mode.measured_sigma * random.normal(size=mode.size)

@@ -114,6 +114,13 @@ def test_the_page_shows_a_tongue_in_both_views(tab):
         assert near(section, colour).sum() > 40
 
 
+def upper_side(line, column):
+    """How high a line (n, 2) lies at most in a column that it crosses, once or more often."""
+    (x, y), (to_x, to_y) = line[:-1].T, line[1:].T
+    crossed = (np.minimum(x, to_x) <= column) & (column <= np.maximum(x, to_x)) & (x != to_x)
+    return (y + (to_y - y) * (column - x) / np.where(crossed, to_x - x, 1.0))[crossed].max()
+
+
 def test_the_contour_is_where_the_model_says_in_every_pose(tab, feed):
     """Scale and place of the 2-D view are taken from the coils, which sit on known points."""
 
@@ -127,17 +134,16 @@ def test_the_contour_is_where_the_model_says_in_every_pose(tab, feed):
         )  # half of its thickness
         return dots, columns, tops, feed.pose.coils[:, 1:], feed.contour()[:, 1:]
 
-    for pose in (REST, RAISED, [-2, 1, -1, 2]):
+    for pose in (REST, RAISED, [-1, 1, -1, 1]):
         feed.show(pose)
         wait_for_pose(tab, pose)
         dots, columns, tops, coils, contour = seen_and_expected()
         scale = np.linalg.norm(dots[2] - dots[0]) / np.linalg.norm(coils[2] - coils[0])
         origin = (dots - scale * coils).mean(axis=0)
         drawn = scale * contour + origin
-        order = np.argsort(drawn[:, 0])
         highest = np.argmax(drawn[:, 1])
         behind = drawn[highest, 0] + np.arange(-10, 11)
-        expected = np.interp(behind, drawn[order, 0], drawn[order, 1])
+        expected = np.array([upper_side(drawn, column) for column in behind])
         found = np.interp(behind, columns, tops)
         assert np.median(np.abs(found - expected)) / scale < 0.8  # mm
 

@@ -268,6 +268,7 @@ def test_the_flags_that_pages_name_exist():
         "model build",
         "model evaluate",
         "model fit",
+        "mri build",
         "mri phantom",
         "mri denoise",
         "mri segment",

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from parametric import parametric_model
 
 from tonguetrack import InputError
 from tonguetrack.drivers import FrameOfReference, Recording, open_recording, write_recording
@@ -34,7 +35,7 @@ SESSION = Session(energy=Energy(beta_speaker=0.01, beta_pose=0.01, gamma_speaker
 
 @pytest.fixture(scope="module")
 def tongues():
-    return bundled_model()
+    return parametric_model()
 
 
 def speech(model, seed, seconds=2.0, noise_mm=0.1, spread=0.6):
@@ -252,12 +253,13 @@ def test_the_command_prints_the_three_ways_side_by_side(desk, capsys):
     assert "mean tongues" in printed and "apart (whole mesh)" in printed
 
 
-def test_the_command_gives_the_same_as_json(desk, capsys, tongues):
+def test_the_command_gives_the_same_as_json(desk, capsys):
+    speakers = bundled_model().speaker
     assert main(asked(desk, "--json", "--seconds", "1")) == 0
     report = json.loads(capsys.readouterr().out)
     assert list(report["ways"]) == [MEAN, JOINT, MESH]
     for found in report["ways"].values():
-        np.testing.assert_allclose(found["normalised"], tongues.speaker.normalised(found["weights"]))
+        np.testing.assert_allclose(found["normalised"], speakers.normalised(found["weights"]))
     assert report["ways"][JOINT]["samples"] == RATE_HZ
     assert len(report["mean_tongue_distances_mm"]) == 3
 

@@ -5,6 +5,8 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
+
 from tonguetrack import InputError
 
 
@@ -12,6 +14,10 @@ def squared(number):
     if number == 7:
         raise InputError("7: nobody squares sevens.")
     return number * number
+
+
+def twice(number):
+    return {"twice": np.array([2.0 * number])}
 
 
 def slow_at_first(number):

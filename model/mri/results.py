@@ -33,6 +33,7 @@ FORMAT = "tonguetrack mri build 1"
 LARGEST_INDEX = 50_000_000
 OFTEN = 2.0  # times its median over all scans: what a measure may be without suspicion
 FAULT = 5.0  # the suspicion of what is certainly wrong
+FLIPPED_FACE = 0.5  # one or two are a matter of looks
 _NOTES = (
     "Its points are {value:.2f} mm away on average, much for this data set.",
     "{value:.0%} of its vertices have no point nearby, many for this data set.",
@@ -238,8 +239,8 @@ def judged(scans: Mapping[Cell, ScanResult], doubts: Mapping[Cell, str]) -> dict
     """The results with their notes and suspicion.
 
     Suspicion is the sum of: the residual, the share of vertices without a point, the way from the first matching to the
-    last, each in units of its median over all scans, beyond twice that; and for a doubtful alignment of the palate and
-    for flipped faces, 5 each. doubts: why an alignment is uncertain, or "".
+    last, each in units of its median over all scans, beyond twice that; 5 for a doubtful alignment of the palate; and half
+    for each flipped face, 5 at most. doubts: why an alignment is uncertain, or "".
     """
     measures = {
         cell: (
@@ -258,12 +259,14 @@ def judged(scans: Mapping[Cell, ScanResult], doubts: Mapping[Cell, str]) -> dict
             for sentence, value, much in zip(_NOTES, measures[cell], beyond, strict=True)
             if much > 0.0
         ]
-        faults = [doubts[cell] and f"The palate's place in this scan is uncertain: {doubts[cell]}."]
-        faults.append(f"{scan.flipped} faces are turned over." if scan.flipped else "")
+        suspicion = float(beyond.sum()) + min(FAULT, FLIPPED_FACE * scan.flipped)
+        if scan.flipped:
+            notes.append(f"{scan.flipped} {'face is' if scan.flipped == 1 else 'faces are'} turned over.")
         if not scan.used:
             notes.append("This mesh is not part of the model.")
-        notes += [fault for fault in faults if fault]
-        suspicion = float(beyond.sum()) + FAULT * sum(bool(fault) for fault in faults)
+        if doubts[cell]:
+            notes.append(f"The palate's place in this scan is uncertain: {doubts[cell]}.")
+            suspicion += FAULT
         judged[cell] = replace(scan, notes=tuple(notes), suspicion=suspicion)
     return judged
 
