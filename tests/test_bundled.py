@@ -45,7 +45,7 @@ def run_script(script, folder, timeout_s=300):
     return work
 
 
-@pytest.mark.skipif(not NIGHTLY, reason="half an hour: runs with TONGUETRACK_FUZZ=nightly")
+@pytest.mark.skipif(not NIGHTLY, reason="a quarter of an hour: runs with TONGUETRACK_FUZZ=nightly")
 def test_the_bundled_model_is_what_its_script_makes(tmp_path):
     pytest.importorskip("nibabel")
     made = load_model(run_script(MAKE_DEFAULT, tmp_path, timeout_s=3 * 3600) / "default.npz")
